@@ -1,0 +1,6 @@
+//! steersman: a from-scratch CNN engine that learns to steer a car from its front camera.
+#![forbid(unsafe_code)]
+
+pub mod error;
+
+pub use error::{Error, Result};

@@ -1,0 +1,4 @@
+//! The `steersman` command.
+#![forbid(unsafe_code)]
+
+fn main() {}
