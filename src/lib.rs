@@ -1,6 +1,14 @@
 //! steersman: a from-scratch CNN engine that learns to steer a car from its front camera.
 #![forbid(unsafe_code)]
 
+pub mod atomic_file;
 pub mod error;
+pub mod layers;
+pub mod network;
+pub mod optimizer;
+pub mod random;
+pub mod report;
+pub mod tensor;
+pub mod training;
 
 pub use error::{Error, Result};

@@ -1,0 +1,306 @@
+//! Recipes: a whole experiment as one TOML file.
+//!
+//! A recipe holds preprocessing, network, samples, balancing, augmentation, split, optimizer and epochs. The shipped ones lie
+//! in `data/recipes/` and are built into the binary. Unknown keys are errors that name the nearest known one.
+//!
+//! # To add a recipe
+//!
+//! Put a TOML file into `data/recipes/` and a line into [`SHIPPED`]; a test builds every shipped recipe.
+
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+use steersman_kernels::Isa;
+
+use crate::dataset::{Augmentation, Balance, Preprocessing, SampleSpec, SplitSpec};
+use crate::error::{Error, Result};
+use crate::network::{LayerSpec, Network};
+use crate::optimizer::{OptimizerSpec, ScheduleSpec};
+use crate::tensor::Shape;
+use crate::training::Loss;
+
+/// Name and text of each recipe that is built in.
+pub const SHIPPED: [(&str, &str); 4] = [
+    ("hyper", include_str!("../data/recipes/hyper.toml")),
+    ("hyper-prelu", include_str!("../data/recipes/hyper-prelu.toml")),
+    ("lenet", include_str!("../data/recipes/lenet.toml")),
+    ("pilotnet", include_str!("../data/recipes/pilotnet.toml")),
+];
+
+/// A whole experiment.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Recipe {
+    /// Name; run folders are called after it.
+    pub name: String,
+    /// One line for people.
+    #[serde(default)]
+    pub about: String,
+    /// Passes over the training side.
+    pub epochs: u32,
+    /// Images in a training step; the last one of an epoch may be smaller.
+    pub batch: usize,
+    /// Angle of the front wheels at steering 1, in degrees; turns errors into degrees.
+    #[serde(default = "default_full_lock_deg")]
+    pub full_lock_deg: f64,
+    /// What training makes small.
+    #[serde(default)]
+    pub loss: Loss,
+    /// Gradients with a larger L2 norm are scaled down to this one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub clip_gradient_norm: Option<f64>,
+    /// When to stop before the last epoch; never when absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub early_stopping: Option<EarlyStopping>,
+    /// The network, from input to output.
+    pub layers: Vec<LayerSpec>,
+    /// From camera image to network input.
+    pub preprocessing: Preprocessing,
+    /// Which images of a row are used, with which labels.
+    #[serde(default)]
+    pub samples: SampleSpec,
+    /// Thinning out of over-frequent labels.
+    #[serde(default)]
+    pub balance: Balance,
+    /// Random changes of training images.
+    #[serde(default)]
+    pub augmentation: Augmentation,
+    /// Training side and validation side.
+    #[serde(default)]
+    pub split: SplitSpec,
+    /// How parameters follow the gradient.
+    pub optimizer: OptimizerSpec,
+    /// How the learning rate changes.
+    #[serde(default)]
+    pub schedule: ScheduleSpec,
+}
+
+/// Ends a run when the validation loss has stopped to fall; the best weights are kept.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EarlyStopping {
+    /// Epochs without improvement before the end.
+    pub patience_epochs: u32,
+    /// A smaller fall of the validation loss is no improvement.
+    #[serde(default)]
+    pub min_delta: f64,
+}
+
+fn default_full_lock_deg() -> f64 {
+    25.0
+}
+
+impl Recipe {
+    /// The built-in recipe `name`, or the one in the file `name` if it ends in `.toml` or is a path; then each `key=value`
+    /// of `overrides` set (`epochs=3`, `optimizer.learning_rate=1e-4`).
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Usage`] for an unknown name, naming the nearest; [`Error::Io`] for an unreadable file; [`Error::Recipe`] and
+    /// [`Error::Network`] for what is wrong inside.
+    pub fn find(name: &str, overrides: &[String]) -> Result<Recipe> {
+        let text = match SHIPPED.iter().find(|(shipped, _)| *shipped == name) {
+            Some((_, text)) => text.to_string(),
+            None if name.ends_with(".toml") || Path::new(name).components().count() > 1 => {
+                std::fs::read_to_string(name).map_err(Error::io(name))?
+            }
+            None => {
+                let names = SHIPPED.map(|(name, _)| name);
+                return Err(Error::Usage(format!(
+                    "there is no recipe `{name}`{}; built in are {}; a recipe of your own is given as FILE.toml",
+                    did_you_mean(name, &names),
+                    names.join(", ")
+                )));
+            }
+        };
+        Recipe::parse(name, &text, overrides)
+    }
+
+    /// The recipe in `text`, called `source` in error messages.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Recipe`] for wrong or unknown entries, [`Error::Network`] for layers that do not fit.
+    pub fn parse(source: &str, text: &str, overrides: &[String]) -> Result<Recipe> {
+        let wrong = |message: String| Error::Recipe { recipe: source.into(), message };
+        let mut table: toml::Table = text.parse().map_err(|e: toml::de::Error| wrong(e.to_string()))?;
+        for entry in overrides {
+            set(&mut table, entry).map_err(Error::Usage)?;
+        }
+        // Layers one by one, so that an error can say which one it means.
+        if let Some(toml::Value::Array(layers)) = table.get("layers") {
+            for (index, layer) in layers.iter().enumerate() {
+                LayerSpec::deserialize(layer.clone())
+                    .map_err(|e| wrong(format!("layers, entry {}: {}", index + 1, with_nearest(e.message()))))?;
+            }
+        }
+        let recipe = Recipe::deserialize(table).map_err(|e| wrong(with_nearest(e.message())))?;
+        recipe.check().map_err(wrong)?;
+        recipe.network(Isa::PORTABLE)?;
+        Ok(recipe)
+    }
+
+    /// The text of a recipe file with every entry resolved.
+    pub fn to_toml(&self) -> String {
+        toml::to_string(self).expect("a recipe consists of strings, numbers, arrays and tables")
+    }
+
+    /// The network of the recipe.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Network`] if a layer does not fit.
+    pub fn network(&self, isa: Isa) -> Result<Network> {
+        let [c, h, w] = self.preprocessing.output();
+        let network = Network::new(Shape::new(c, h, w), &self.layers, isa)?;
+        if network.output() != Shape::vector(1) {
+            let layer = network.layers().last().map_or(String::new(), |l| l.name.clone());
+            let message = format!("the last layer must give one number, the steering; this one gives {}", network.output());
+            return Err(Error::Network { layer, message });
+        }
+        Ok(network)
+    }
+
+    fn check(&self) -> Result<(), String> {
+        if self.epochs == 0 || self.batch == 0 {
+            return Err("epochs and batch must be at least 1".into());
+        }
+        if !(self.full_lock_deg.is_finite() && self.full_lock_deg > 0.0) {
+            return Err(format!("full_lock_deg must be a positive number, not {}", self.full_lock_deg));
+        }
+        if self.clip_gradient_norm.is_some_and(|norm| !(norm.is_finite() && norm > 0.0)) {
+            return Err("clip_gradient_norm must be a positive number".into());
+        }
+        if let Loss::Huber { delta } = self.loss
+            && !(delta.is_finite() && delta > 0.0)
+        {
+            return Err(format!("loss.delta must be a positive number, not {delta}"));
+        }
+        self.optimizer.check().map_err(|message| format!("[optimizer] {message}"))?;
+        self.schedule.check().map_err(|message| format!("[schedule] {message}"))?;
+        self.preprocessing.validate().map_err(|e| e.to_string())?;
+        self.samples.validate().map_err(|e| e.to_string())?;
+        self.balance.validate().map_err(|e| e.to_string())?;
+        self.augmentation.validate().map_err(|e| e.to_string())?;
+        self.split.validate().map_err(|e| e.to_string())
+    }
+}
+
+/// Sets `a.b.c=value` in `table`. A value that is no TOML counts as a string.
+fn set(table: &mut toml::Table, entry: &str) -> Result<(), String> {
+    let (key, value) =
+        entry.split_once('=').ok_or_else(|| format!("--set takes key=value, as in epochs=3; found `{entry}`"))?;
+    let value = value.trim();
+    let parsed = format!("value = {value}").parse::<toml::Table>().ok().and_then(|mut t| t.remove("value"));
+    let parsed = parsed.unwrap_or_else(|| toml::Value::String(value.into()));
+    let mut path: Vec<&str> = key.split('.').map(str::trim).collect();
+    let last = path.pop().unwrap_or_default();
+    let mut inner = table;
+    for part in path {
+        inner = inner
+            .entry(part)
+            .or_insert_with(|| toml::Value::Table(toml::Table::new()))
+            .as_table_mut()
+            .ok_or_else(|| format!("--set {key}: `{part}` is a single value, it has no entries"))?;
+    }
+    inner.insert(last.into(), parsed);
+    Ok(())
+}
+
+/// ` (did you mean …?)` with the nearest of `known`, or nothing if none is near.
+pub fn did_you_mean(name: &str, known: &[&str]) -> String {
+    known
+        .iter()
+        .map(|candidate| (strsim::damerau_levenshtein(name, candidate), candidate))
+        .min()
+        .filter(|(distance, candidate)| *distance <= 1 + name.len().max(candidate.len()) / 3)
+        .map_or(String::new(), |(_, candidate)| format!(" (did you mean `{candidate}`?)"))
+}
+
+/// Adds the nearest known name to serde's «unknown field `x`, expected one of `a`, `b`».
+fn with_nearest(message: &str) -> String {
+    let message = message.trim_end();
+    if !message.starts_with("unknown ") {
+        return message.into();
+    }
+    let mut quoted = message.split('`').skip(1).step_by(2);
+    let unknown = quoted.next().unwrap_or_default();
+    let known: Vec<&str> = quoted.collect();
+    match did_you_mean(unknown, &known) {
+        hint if hint.is_empty() => message.into(),
+        hint => format!("{}{hint}", message.split(',').next().unwrap_or(message)),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn totals(name: &str) -> (usize, usize) {
+        let network = Recipe::find(name, &[]).unwrap().network(Isa::PORTABLE).unwrap();
+        (network.count(true) + network.count(false), network.count(true))
+    }
+
+    #[test]
+    fn shipped_networks_have_the_published_numbers_of_parameters() {
+        assert_eq!(totals("hyper"), (176_159, 175_671));
+        assert_eq!(totals("hyper-prelu").0, 314_047);
+        assert_eq!(totals("lenet").0, 28_589);
+        assert_eq!(totals("pilotnet").0, 252_219);
+    }
+
+    #[test]
+    fn shipped_networks_have_the_published_numbers_of_multiply_adds() {
+        for (name, expected) in [("hyper", 13_864_346), ("lenet", 381_036), ("pilotnet", 26_876_342)] {
+            let network = Recipe::find(name, &[]).unwrap().network(Isa::PORTABLE).unwrap();
+            assert_eq!(network.multiply_adds(), expected, "{name}");
+        }
+    }
+
+    #[test]
+    fn shipped_recipes_are_called_like_their_files_and_survive_being_written() {
+        for (name, _) in SHIPPED {
+            let recipe = Recipe::find(name, &[]).unwrap();
+            assert_eq!(recipe.name, name);
+            assert_eq!(Recipe::parse(name, &recipe.to_toml(), &[]).unwrap(), recipe);
+        }
+    }
+
+    #[test]
+    fn overrides_reach_every_level() {
+        let overrides = ["epochs=3", "optimizer.learning_rate = 0.5", "split.mode=random", "schedule.warmup_updates=9"];
+        let recipe = Recipe::find("lenet", &overrides.map(String::from)).unwrap();
+        assert_eq!((recipe.epochs, recipe.optimizer.learning_rate()), (3, 0.5));
+        assert_eq!(recipe.schedule.warmup_updates, 9);
+    }
+
+    fn error(overrides: &[&str]) -> String {
+        let overrides: Vec<String> = overrides.iter().map(|s| s.to_string()).collect();
+        Recipe::find("lenet", &overrides).unwrap_err().to_string()
+    }
+
+    #[test]
+    fn unknown_names_are_errors_that_name_the_nearest_known_one() {
+        assert_eq!(error(&["epoch=3"]), "recipe lenet: unknown field `epoch` (did you mean `epochs`?)");
+        assert!(error(&["optimizer.learningrate=1"]).ends_with("`learningrate` (did you mean `learning_rate`?)"));
+        assert!(error(&["split.mod=1"]).contains("did you mean `mode`?"));
+        let recipe = Recipe::find("lente", &[]).unwrap_err().to_string();
+        assert!(recipe.starts_with("there is no recipe `lente` (did you mean `lenet`?); built in are hyper,"), "{recipe}");
+        let layers = SHIPPED[2].1.replacen("filters = 6", "filter = 6", 1);
+        let layer = Recipe::parse("mine.toml", &layers, &[]).unwrap_err().to_string();
+        assert_eq!(
+            layer,
+            "recipe mine.toml: layers, entry 2: unknown field `filter` (did you mean `filters`?)"
+        );
+    }
+
+    #[test]
+    fn wrong_numbers_are_errors() {
+        assert!(error(&["epochs=0"]).contains("at least 1"));
+        assert!(error(&["epochs"]).contains("key=value"));
+        assert!(error(&["epochs.x=1"]).contains("single value"));
+        assert!(error(&["optimizer.learning_rate=-1"]).contains("learning_rate must be a positive number"));
+        assert!(error(&["preprocessing.rows=[10, 200]"]).contains("rows"));
+        assert!(error(&["preprocessing.resize=[4, 4]"]).contains("layer `pool1`"));
+    }
+}

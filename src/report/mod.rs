@@ -1,0 +1,5 @@
+//! Measures of how well a model predicts.
+
+mod metrics;
+
+pub use metrics::{Metrics, Prediction};

@@ -1,0 +1,3 @@
+//! Training.
+mod loss;
+pub use loss::Loss;
