@@ -1,0 +1,1 @@
+//! Image to patch matrix and back.

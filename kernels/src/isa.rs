@@ -1,0 +1,139 @@
+//! Which instruction set the machine has, found once at run time.
+
+use std::sync::OnceLock;
+
+/// The instruction sets that kernels are compiled for, from the narrowest to the widest.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Debug)]
+pub(crate) enum Level {
+    /// Plain Rust with the instructions every processor of the target architecture has.
+    Portable,
+    /// aarch64 with NEON: 4 lanes and fused multiply-add.
+    #[cfg_attr(not(target_arch = "aarch64"), expect(dead_code, reason = "only found on aarch64"))]
+    Neon,
+    /// x86-64 with AVX2 and FMA: 8 lanes, 16 registers.
+    #[cfg_attr(not(target_arch = "x86_64"), expect(dead_code, reason = "only found on x86-64"))]
+    Avx2,
+    /// x86-64 with AVX-512 F, BW, DQ and VL: 16 lanes, 32 registers.
+    #[cfg_attr(not(target_arch = "x86_64"), expect(dead_code, reason = "only found on x86-64"))]
+    Avx512,
+}
+
+/// A token that proves that this processor has an instruction set.
+///
+/// The only values are [`Isa::PORTABLE`] and those that detection returned, so calling code compiled for the
+/// instruction set of an `Isa` is sound.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Debug)]
+pub struct Isa(Level);
+
+impl Isa {
+    /// What every processor can run.
+    pub const PORTABLE: Isa = Isa(Level::Portable);
+
+    /// The widest instruction set of this processor, detected once.
+    ///
+    /// The environment variable `STEERSMAN_ISA` (`portable`, `neon`, `avx2` or `avx512`) lowers it, for tests; a name
+    /// that this processor does not have, or that is unknown, is ignored.
+    pub fn best() -> Isa {
+        static BEST: OnceLock<Isa> = OnceLock::new();
+        *BEST.get_or_init(|| {
+            let available = Isa::available();
+            let wanted = std::env::var("STEERSMAN_ISA").unwrap_or_default();
+            let named = available.iter().find(|isa| isa.name() == wanted);
+            *named.or(available.last()).unwrap_or(&Isa::PORTABLE)
+        })
+    }
+
+    /// Every instruction set this processor can run, from [`Isa::PORTABLE`] to the widest.
+    pub fn available() -> Vec<Isa> {
+        let mut found = vec![Isa::PORTABLE];
+        #[cfg(target_arch = "aarch64")]
+        if std::arch::is_aarch64_feature_detected!("neon") {
+            found.push(Isa(Level::Neon));
+        }
+        #[cfg(target_arch = "x86_64")]
+        if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {
+            found.push(Isa(Level::Avx2));
+            if is_x86_feature_detected!("avx512f")
+                && is_x86_feature_detected!("avx512bw")
+                && is_x86_feature_detected!("avx512dq")
+                && is_x86_feature_detected!("avx512vl")
+            {
+                found.push(Isa(Level::Avx512));
+            }
+        }
+        found
+    }
+
+    /// The name that `STEERSMAN_ISA` understands.
+    pub fn name(self) -> &'static str {
+        match self.0 {
+            Level::Portable => "portable",
+            Level::Neon => "neon",
+            Level::Avx2 => "avx2",
+            Level::Avx512 => "avx512",
+        }
+    }
+
+    pub(crate) fn level(self) -> Level {
+        self.0
+    }
+}
+
+/// Writes a function that compiles its body once for each instruction set and picks one by an [`Isa`].
+///
+/// `fn name<S>(simd: S, x: T)` becomes `fn name(isa: Isa, x: T)`; in the body `S` is a [`crate::simd::Simd`] type and
+/// `simd` its token. A body that ignores the token is a plain loop which the compiler vectorises for each set.
+macro_rules! per_isa {
+    ($(#[$meta:meta])* $vis:vis fn $name:ident<$s:ident>($simd:ident : $s2:ident $(, $arg:ident : $ty:ty)* $(,)?)
+        $(-> $ret:ty)? $body:block) => {
+        $(#[$meta])*
+        $vis fn $name(isa: $crate::isa::Isa $(, $arg: $ty)*) $(-> $ret)? {
+            #[inline(always)]
+            fn body<$s: $crate::simd::Simd>($simd: $s $(, $arg: $ty)*) $(-> $ret)? $body
+
+            #[cfg(target_arch = "x86_64")]
+            #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx2,fma")]
+            fn avx512($($arg: $ty),*) $(-> $ret)? {
+                body($crate::simd::x86::Avx512::new() $(, $arg)*)
+            }
+
+            #[cfg(target_arch = "x86_64")]
+            #[target_feature(enable = "avx2,fma")]
+            fn avx2($($arg: $ty),*) $(-> $ret)? {
+                body($crate::simd::x86::Avx2::new() $(, $arg)*)
+            }
+
+            #[cfg(target_arch = "aarch64")]
+            #[target_feature(enable = "neon")]
+            fn neon($($arg: $ty),*) $(-> $ret)? {
+                body($crate::simd::neon::Neon::new() $(, $arg)*)
+            }
+
+            match isa.level() {
+                #[cfg(target_arch = "x86_64")]
+                // SAFETY: an `Isa` of this level exists only after detection found its features.
+                $crate::isa::Level::Avx512 => unsafe { avx512($($arg),*) },
+                #[cfg(target_arch = "x86_64")]
+                // SAFETY: an `Isa` of this level exists only after detection found its features.
+                $crate::isa::Level::Avx2 => unsafe { avx2($($arg),*) },
+                #[cfg(target_arch = "aarch64")]
+                // SAFETY: an `Isa` of this level exists only after detection found its features.
+                $crate::isa::Level::Neon => unsafe { neon($($arg),*) },
+                _ => body($crate::simd::portable::Portable $(, $arg)*),
+            }
+        }
+    };
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_best_is_available_and_portable_always_is() {
+        let available = Isa::available();
+        assert_eq!(available[0], Isa::PORTABLE);
+        assert!(available.contains(&Isa::best()));
+        assert!(available.windows(2).all(|pair| pair[0] < pair[1]));
+    }
+}

@@ -1,0 +1,90 @@
+//! One trait for the vector instructions the kernels need, and a type for each instruction set.
+//!
+//! The types are tokens: those of [`x86`] and [`neon`] can only be made in code compiled for their instruction set, so
+//! their arithmetic is safe. What takes a pointer is not. Every method is `#[inline(always)]`, so that it lands in a
+//! function compiled for its instruction set (see `per_isa!`).
+
+#[cfg(target_arch = "aarch64")]
+pub(crate) mod neon;
+pub(crate) mod portable;
+#[cfg(target_arch = "x86_64")]
+pub(crate) mod x86;
+
+/// Vectors of `LANES` values of `f32`.
+pub(crate) trait Simd: Copy {
+    /// A vector.
+    type V: Copy;
+    /// Values in a vector, at most 16.
+    const LANES: usize;
+    /// Whether there are 32 registers, enough for 24 accumulators, and not 16, enough for 12.
+    const MANY_REGISTERS: bool;
+
+    /// The value in every lane.
+    fn splat(self, value: f32) -> Self::V;
+    /// `a * b + c`, fused where the instruction set can.
+    fn mul_add(self, a: Self::V, b: Self::V, c: Self::V) -> Self::V;
+    /// The sum of all lanes, in a fixed order.
+    fn sum(self, v: Self::V) -> f32;
+
+    /// Reads `LANES` values.
+    ///
+    /// # Safety
+    /// `p` must be valid for reading `LANES` values.
+    unsafe fn load(self, p: *const f32) -> Self::V;
+    /// Reads the first `count <= LANES` values; the other lanes are 0.
+    ///
+    /// # Safety
+    /// `p` must be valid for reading `count` values.
+    unsafe fn load_first(self, p: *const f32, count: usize) -> Self::V;
+    /// Writes `LANES` values.
+    ///
+    /// # Safety
+    /// `p` must be valid for writing `LANES` values.
+    unsafe fn store(self, p: *mut f32, v: Self::V);
+    /// Writes the first `count <= LANES` lanes.
+    ///
+    /// # Safety
+    /// `p` must be valid for writing `count` values.
+    unsafe fn store_first(self, p: *mut f32, v: Self::V, count: usize);
+
+    /// Reads as many consecutive values as `mask` has bits and spreads them over the lanes whose bits are set, in
+    /// order; the other lanes are 0.
+    ///
+    /// # Safety
+    /// `p` must be valid for reading `mask.count_ones()` values, and no bit at or above `LANES` may be set.
+    #[inline(always)]
+    unsafe fn load_spread(self, p: *const f32, mask: u32) -> Self::V {
+        let mut lanes = [0.0; 16];
+        let (mut rest, mut next) = (mask, p);
+        while rest != 0 {
+            // SAFETY: one step for each bit of the mask, for which the caller vouches.
+            unsafe {
+                lanes[rest.trailing_zeros() as usize & 15] = *next;
+                next = next.add(1);
+            }
+            rest &= rest - 1;
+        }
+        // SAFETY: `lanes` holds 16 values, and no vector is longer.
+        unsafe { self.load(lanes.as_ptr()) }
+    }
+
+    /// Writes the lanes whose bits are set in `mask` one after the other, leaving out the rest.
+    ///
+    /// # Safety
+    /// `p` must be valid for writing `mask.count_ones()` values, and no bit at or above `LANES` may be set.
+    #[inline(always)]
+    unsafe fn store_gathered(self, p: *mut f32, v: Self::V, mask: u32) {
+        let mut lanes = [0.0; 16];
+        // SAFETY: `lanes` holds 16 values, and no vector is longer.
+        unsafe { self.store(lanes.as_mut_ptr(), v) };
+        let (mut rest, mut next) = (mask, p);
+        while rest != 0 {
+            // SAFETY: one step for each bit of the mask, for which the caller vouches.
+            unsafe {
+                *next = lanes[rest.trailing_zeros() as usize & 15];
+                next = next.add(1);
+            }
+            rest &= rest - 1;
+        }
+    }
+}

@@ -1,0 +1,55 @@
+//! Four lanes in plain Rust, for processors without a better instruction set.
+
+use super::Simd;
+
+/// The token of plain Rust; anyone may have it.
+#[derive(Clone, Copy)]
+pub(crate) struct Portable;
+
+impl Simd for Portable {
+    type V = [f32; 4];
+    const LANES: usize = 4;
+    const MANY_REGISTERS: bool = false;
+
+    #[inline(always)]
+    fn splat(self, value: f32) -> [f32; 4] {
+        [value; 4]
+    }
+
+    #[inline(always)]
+    fn mul_add(self, a: [f32; 4], b: [f32; 4], c: [f32; 4]) -> [f32; 4] {
+        // Not `f32::mul_add`: without the instruction that is a slow call to the C library.
+        std::array::from_fn(|i| a[i] * b[i] + c[i])
+    }
+
+    #[inline(always)]
+    fn sum(self, v: [f32; 4]) -> f32 {
+        (v[0] + v[1]) + (v[2] + v[3])
+    }
+
+    #[inline(always)]
+    unsafe fn load(self, p: *const f32) -> [f32; 4] {
+        // SAFETY: the caller vouches for 4 values; the read needs no alignment.
+        unsafe { p.cast::<[f32; 4]>().read_unaligned() }
+    }
+
+    #[inline(always)]
+    unsafe fn load_first(self, p: *const f32, count: usize) -> [f32; 4] {
+        // SAFETY: only the first `count` values are read, for which the caller vouches.
+        std::array::from_fn(|i| if i < count { unsafe { *p.add(i) } } else { 0.0 })
+    }
+
+    #[inline(always)]
+    unsafe fn store(self, p: *mut f32, v: [f32; 4]) {
+        // SAFETY: the caller vouches for 4 values; the write needs no alignment.
+        unsafe { p.cast::<[f32; 4]>().write_unaligned(v) }
+    }
+
+    #[inline(always)]
+    unsafe fn store_first(self, p: *mut f32, v: [f32; 4], count: usize) {
+        for (i, value) in v.into_iter().enumerate().take(count) {
+            // SAFETY: only the first `count` values are written, for which the caller vouches.
+            unsafe { *p.add(i) = value };
+        }
+    }
+}
