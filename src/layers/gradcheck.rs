@@ -103,7 +103,7 @@ impl<'a> Harness<'a> {
     }
 
     /// Central difference of the loss for each element of what `select` picks.
-    fn numerical(&mut self, select: fn(&mut Harness<'a>) -> &mut Vec<f32>) -> Vec<f64> {
+    fn numerical(&mut self, select: for<'b> fn(&'b mut Harness<'a>) -> &'b mut Vec<f32>) -> Vec<f64> {
         (0..select(self).len())
             .map(|i| {
                 let value = select(self)[i];
@@ -175,7 +175,7 @@ mod tests {
         assert!(relative_error(&[1.0, -2.0, 0.5], &numerical) < 1e-7);
         assert!(relative_error(&[1.0, 2.0, 0.5], &numerical) > 1.0);
         let error = relative_error(&[f32::NAN, -2.0, 0.5], &numerical);
-        assert!(!(error <= TOLERANCE), "a comparison the other way round would let NaN pass");
+        assert_eq!(error.partial_cmp(&TOLERANCE), None, "so `error <= TOLERANCE` is false, as it must be");
     }
 
     #[test]
