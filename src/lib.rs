@@ -1,6 +1,7 @@
 //! steersman: a from-scratch CNN engine that learns to steer a car from its front camera.
 #![forbid(unsafe_code)]
 
+pub mod dataset;
 pub mod error;
 pub mod random;
 
