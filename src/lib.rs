@@ -2,11 +2,14 @@
 #![forbid(unsafe_code)]
 
 pub mod atomic_file;
+pub mod dataset;
 pub mod error;
 pub mod layers;
+pub mod model_file;
 pub mod network;
 pub mod optimizer;
 pub mod random;
+pub mod recipe;
 pub mod report;
 pub mod tensor;
 pub mod training;

@@ -1,0 +1,6 @@
+//! Recordings: reading, splitting, preprocessing and loading them.
+
+pub mod colour;
+pub mod decode;
+pub mod preprocess;
+pub mod resize;
