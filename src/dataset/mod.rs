@@ -4,3 +4,6 @@ pub mod colour;
 pub mod decode;
 pub mod preprocess;
 pub mod resize;
+mod spec_tmp;
+pub use spec_tmp::*;
+pub use preprocess::Preprocessing;

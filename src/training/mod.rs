@@ -1,3 +1,26 @@
-//! Training.
+//! Training: the loop, validation, checkpoints, and the run folder that holds what comes of it.
+//!
+//! | file of the run folder | what it is |
+//! |---|---|
+//! | `recipe.toml` | the recipe with every entry resolved |
+//! | `run.json` | recordings, seed, version: what `--resume` needs besides |
+//! | `split.csv` | which row went to which side |
+//! | `history.csv` | one line an epoch |
+//! | `model.safetensors` | the best model, by validation loss |
+//! | `last.safetensors` | the model of the last epoch |
+//! | `checkpoint.safetensors` | where the run stands |
+//! | `result.json` | what `train --json` prints; its presence says that the run is finished |
+
+mod checkpoint;
+mod history;
 mod loss;
+mod run_folder;
+mod session;
+mod validation;
+
+pub use checkpoint::{Progress, State};
+pub use history::{EpochRecord, write_history};
 pub use loss::Loss;
+pub use run_folder::RunFolder;
+pub use session::{Observer, TrainRequest, TrainResult, resume, train};
+pub use validation::{Validation, ValidationResult};

@@ -1,7 +1,7 @@
 //! The formula numbers of `tests/golden/README.md`, which Python and Rust evaluate alike.
 
 /// The hash of a tensor's flat indices.
-pub fn hash(name: &str) -> impl Fn(usize) -> u32 {
+pub fn hash(name: &str) -> impl Fn(usize) -> u32 + use<> {
     let seed = name.bytes().fold(0x811c_9dc5_u32, |hash, byte| (hash ^ u32::from(byte)).wrapping_mul(0x0100_0193));
     move |index| {
         let mut h = (index as u32).wrapping_mul(0x9e37_79b1).wrapping_add(seed);

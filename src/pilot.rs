@@ -1,0 +1,164 @@
+//! A trained model at the wheel: image in, steering out.
+
+use std::path::Path;
+
+use steersman_kernels::Isa;
+
+use crate::dataset::decode::{RgbImage, decode_rgb};
+use crate::dataset::preprocess::Preprocessor;
+use crate::error::{Error, Result};
+use crate::model_file::Model;
+use crate::network::{InferencePlan, Network, Parameters};
+use crate::recipe::Recipe;
+
+/// A model with everything planned to predict one image after the other on the calling thread.
+///
+/// The same code evaluates recordings, answers `predict` and drives, so all of them see an image alike. After the first image
+/// of a size nothing is allocated.
+///
+/// ```no_run
+/// use std::path::Path;
+/// use steersman::pilot::Pilot;
+///
+/// let mut pilot = Pilot::load(Path::new("runs/lenet-1/model.safetensors"))?;
+/// let jpeg = std::fs::read("frame.jpg").unwrap();
+/// let steering = pilot.steer_encoded(&jpeg)?;
+/// println!("{steering:+.3}, that is {:+.1} degrees", pilot.recipe().full_lock_deg * f64::from(steering));
+/// # Ok::<(), steersman::Error>(())
+/// ```
+#[derive(Debug)]
+pub struct Pilot {
+    recipe: Recipe,
+    network: Network,
+    parameters: Parameters,
+    plan: InferencePlan,
+    preprocessor: Preprocessor,
+    image: RgbImage,
+    planes: Vec<u8>,
+    input: Vec<f32>,
+}
+
+impl Pilot {
+    /// The pilot of the model file `path`.
+    ///
+    /// # Errors
+    ///
+    /// As [`Model::load`].
+    pub fn load(path: &Path) -> Result<Pilot> {
+        Pilot::new(Model::load(path)?, Isa::best())
+    }
+
+    /// The pilot of `model`, with the vector code of `isa`.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Network`] if the recipe's layers do not fit.
+    pub fn new(model: Model, isa: Isa) -> Result<Pilot> {
+        let Model { recipe, parameters, .. } = model;
+        let network = recipe.network(isa)?;
+        let [height, width] = recipe.preprocessing.source;
+        Ok(Pilot {
+            plan: InferencePlan::new(&network, 1),
+            preprocessor: recipe.preprocessing.plan(height, width)?,
+            image: RgbImage::default(),
+            planes: vec![0; recipe.preprocessing.output_len()],
+            input: vec![0.0; recipe.preprocessing.output_len()],
+            recipe,
+            network,
+            parameters,
+        })
+    }
+
+    /// How the model was made.
+    pub fn recipe(&self) -> &Recipe {
+        &self.recipe
+    }
+
+    /// Steering for an RGB image, `[height][width][3]`. Roughly in [−1, 1], positive to the right; not clamped.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Usage`] if the image has no pixels, or not as many as it says.
+    pub fn steer(&mut self, height: usize, width: usize, rgb: &[u8]) -> Result<f32> {
+        if rgb.len() != height * width * 3 {
+            return Err(Error::Usage(format!("{} bytes are no RGB image of {width}x{height} pixels", rgb.len())));
+        }
+        if self.preprocessor.image_size() != [height, width] {
+            self.preprocessor = self.recipe.preprocessing.plan(height, width)?;
+        }
+        self.preprocessor.apply(rgb, &mut self.planes);
+        self.recipe.preprocessing.to_input(&self.planes, &mut self.input);
+        let mut steering = [0.0];
+        self.plan.run(&self.network, &self.parameters, &self.input, &mut steering);
+        Ok(steering[0])
+    }
+
+    /// Steering for a JPEG or PNG image.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Usage`] that says what is wrong with the image.
+    pub fn steer_encoded(&mut self, bytes: &[u8]) -> Result<f32> {
+        let mut image = std::mem::take(&mut self.image);
+        let steering = match decode_rgb(bytes, &mut image) {
+            Ok(()) => self.steer(image.height, image.width, &image.pixels),
+            Err(message) => Err(Error::Usage(message)),
+        };
+        self.image = image;
+        steering
+    }
+
+    /// Steering for an image file.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Io`] if it cannot be read, [`Error::Data`] if it is no image.
+    pub fn steer_file(&mut self, path: &Path) -> Result<f32> {
+        let bytes = std::fs::read(path).map_err(Error::io(path))?;
+        self.steer_encoded(&bytes).map_err(|e| match e {
+            Error::Usage(message) => Error::data(path, message),
+            other => other,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::model_file::TrainingRecord;
+
+    fn pilot(name: &str) -> Pilot {
+        let recipe = Recipe::find(name, &[]).unwrap();
+        let parameters = recipe.network(Isa::best()).unwrap().initialize(1);
+        let record = TrainingRecord::default();
+        Pilot::new(Model { recipe, parameters, record, training_rows: vec![] }, Isa::best()).unwrap()
+    }
+
+    #[test]
+    fn every_recipe_steers_an_image_of_any_size() {
+        let mut pixel = 0u8;
+        let mut picture = |len: usize| -> Vec<u8> {
+            (0..len)
+                .map(|_| {
+                    pixel = pixel.wrapping_mul(41).wrapping_add(17);
+                    pixel
+                })
+                .collect()
+        };
+        let (usual, small) = (picture(160 * 320 * 3), picture(120 * 160 * 3));
+        for (name, _) in crate::recipe::SHIPPED {
+            let mut pilot = pilot(name);
+            let first = pilot.steer(160, 320, &usual).unwrap();
+            assert!(pilot.steer(120, 160, &small).unwrap().is_finite());
+            assert_eq!(pilot.steer(160, 320, &usual).unwrap(), first, "{name}: an image must not depend on earlier ones");
+        }
+    }
+
+    #[test]
+    fn what_is_no_image_is_an_error() {
+        let mut pilot = pilot("lenet");
+        assert!(pilot.steer(160, 320, &[0; 7]).is_err());
+        assert!(pilot.steer(0, 0, &[]).is_err());
+        assert_eq!(pilot.steer_encoded(b"GIF89a").unwrap_err().to_string(), "neither a JPEG nor a PNG image");
+    }
+}

@@ -1,0 +1,148 @@
+//! Where a run stands, on disk: enough to go on as if it had never stopped.
+
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+
+use super::history::EpochRecord;
+use crate::error::{Error, Result};
+use crate::model_file::{self, StoredTensor};
+use crate::network::{Network, Parameters};
+use crate::optimizer::{Optimizer, Plateau};
+
+const FORMAT: u32 = 1;
+const OPTIMIZER_FIRST: &str = "optimizer.first";
+const OPTIMIZER_SECOND: &str = "optimizer.second";
+const BEST: &str = "best.";
+
+/// Everything that changes during a run.
+#[derive(Clone, Debug)]
+pub struct State {
+    /// The weights as they are now.
+    pub parameters: Parameters,
+    /// Its clock and moving averages.
+    pub optimizer: Optimizer,
+    /// The weights of the best epoch so far.
+    pub best: Option<Parameters>,
+    /// The small numbers.
+    pub progress: Progress,
+}
+
+/// The small numbers of [`State`].
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Progress {
+    /// The epoch under way, from 0.
+    pub epoch: u32,
+    /// Its next batch.
+    pub next_batch: usize,
+    /// Losses of its batches so far, each times its images.
+    pub loss_sum: f64,
+    /// Its images so far.
+    pub images: usize,
+    /// Its training time so far.
+    pub train_seconds: f64,
+    /// Which epoch the best weights are of, from 1.
+    pub best_epoch: u32,
+    /// Their validation loss.
+    pub best_val_mse: Option<f64>,
+    /// Epochs since the validation loss last improved by the recipe's `min_delta`, and what it was then.
+    pub epochs_since_improvement: u32,
+    /// See above.
+    pub improved_val_mse: Option<f64>,
+    /// What the learning-rate schedule remembers.
+    pub plateau: Plateau,
+    /// The epochs that are done.
+    pub history: Vec<EpochRecord>,
+    /// Wall time of the run so far.
+    pub seconds: f64,
+}
+
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Metadata {
+    format: u32,
+    updates: u64,
+    has_best: bool,
+    progress: Progress,
+}
+
+impl State {
+    /// Writes the state, in whole or not at all.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Io`].
+    pub fn save(&self, path: &Path, network: &Network) -> Result<()> {
+        let metadata = Metadata {
+            format: FORMAT,
+            updates: self.optimizer.updates,
+            has_best: self.best.is_some(),
+            progress: self.progress.clone(),
+        };
+        let metadata = serde_json::to_string(&metadata).map_err(|e| Error::data(path, e.to_string()))?;
+        let mut tensors = model_file::tensors_of(network, &self.parameters);
+        for (name, values) in [(OPTIMIZER_FIRST, &self.optimizer.first), (OPTIMIZER_SECOND, &self.optimizer.second)] {
+            tensors.push(StoredTensor::vector(name, values));
+        }
+        for tensor in self.best.iter().flat_map(|best| model_file::tensors_of(network, best)) {
+            tensors.push(StoredTensor { name: format!("{BEST}{}", tensor.name), ..tensor });
+        }
+        model_file::write_tensors(path, &tensors, metadata)
+    }
+
+    /// Reads a state for `network`; `optimizer` is a fresh one and takes over what is stored.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Io`] and [`Error::Data`].
+    pub fn load(path: &Path, network: &Network, mut optimizer: Optimizer) -> Result<State> {
+        let bytes = std::fs::read(path).map_err(Error::io(path))?;
+        let (tensors, metadata) = model_file::read_tensors(path, &bytes)?;
+        let metadata: Metadata =
+            serde_json::from_str(&metadata).map_err(|e| Error::data(path, format!("is no checkpoint: {e}")))?;
+        if metadata.format != FORMAT {
+            return Err(Error::data(path, format!("is a checkpoint of format {}, not {FORMAT}", metadata.format)));
+        }
+        for (name, values) in [(OPTIMIZER_FIRST, &mut optimizer.first), (OPTIMIZER_SECOND, &mut optimizer.second)] {
+            *values = model_file::find_f32(path, &tensors, name, &[values.len()])?;
+        }
+        optimizer.updates = metadata.updates;
+        let best = match metadata.has_best {
+            true => Some(model_file::read_parameters(path, network, &tensors, BEST)?),
+            false => None,
+        };
+        let parameters = model_file::read_parameters(path, network, &tensors, "")?;
+        Ok(State { parameters, optimizer, best, progress: metadata.progress })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::optimizer::OptimizerSpec;
+    use crate::recipe::Recipe;
+    use steersman_kernels::Isa;
+
+    #[test]
+    fn a_state_comes_back_as_it_was() {
+        let network = Recipe::find("lenet", &[]).unwrap().network(Isa::PORTABLE).unwrap();
+        let spec = OptimizerSpec::Sgd { learning_rate: 0.1, momentum: 0.9, l2: 0.0, decoupled_weight_decay: 0.0 };
+        let mut state = State {
+            parameters: network.initialize(1),
+            optimizer: Optimizer::new(spec, None, &network),
+            best: Some(network.initialize(2)),
+            progress: Progress { epoch: 3, loss_sum: 0.1 + 0.2, best_val_mse: Some(1.0 / 3.0), ..Progress::default() },
+        };
+        state.optimizer.updates = 77;
+        state.optimizer.first[5] = 0.25;
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("checkpoint.safetensors");
+        state.save(&path, &network).unwrap();
+        let read = State::load(&path, &network, Optimizer::new(spec, None, &network)).unwrap();
+        assert_eq!(read.parameters, state.parameters);
+        assert_eq!(read.best, state.best);
+        assert_eq!(read.progress, state.progress);
+        assert_eq!((read.optimizer.updates, read.optimizer.first), (77, state.optimizer.first));
+    }
+}

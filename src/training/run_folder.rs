@@ -1,0 +1,127 @@
+//! The folder of a run.
+
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use serde::de::DeserializeOwned;
+
+use crate::atomic_file;
+use crate::error::{Error, Result};
+use crate::recipe::Recipe;
+
+/// The folder of a run, and the names of what is in it.
+#[derive(Clone, Debug)]
+pub struct RunFolder {
+    path: PathBuf,
+}
+
+/// What `run.json` says.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RunInfo {
+    /// Version of the program that began the run.
+    pub version: String,
+    /// Vector code it ran on.
+    pub isa: String,
+    /// Seed of all random choices.
+    pub seed: u64,
+    /// Absolute paths of the recordings.
+    pub recordings: Vec<PathBuf>,
+    /// Memory for decoded images, in MiB.
+    pub cache_mib: usize,
+    /// Hash over the rows of both sides: the recordings must not change during a run.
+    pub rows_hash: String,
+}
+
+impl RunFolder {
+    /// A new run in `path`, which must not exist or be empty.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Usage`] if there is something in it already, [`Error::Io`] if it cannot be made.
+    pub fn create(path: &Path) -> Result<RunFolder> {
+        if path.exists() && std::fs::read_dir(path).map_err(Error::io(path))?.next().is_some() {
+            return Err(Error::Usage(format!(
+                "{} is not empty and stays as it is; give another folder with --out, or go on with that run: --resume {}",
+                path.display(),
+                path.display()
+            )));
+        }
+        std::fs::create_dir_all(path).map_err(Error::io(path))?;
+        Ok(RunFolder { path: path.to_path_buf() })
+    }
+
+    /// The run in `path`.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Usage`] if `path` is no run folder.
+    pub fn open(path: &Path) -> Result<RunFolder> {
+        let folder = RunFolder { path: path.to_path_buf() };
+        if !folder.file("run.json").is_file() {
+            return Err(Error::Usage(format!("{} is no run folder: it has no run.json", path.display())));
+        }
+        Ok(folder)
+    }
+
+    /// The first of `runs/NAME-1`, `runs/NAME-2`, … that does not exist.
+    pub fn next_free(name: &str) -> PathBuf {
+        (1..).map(|n| Path::new("runs").join(format!("{name}-{n}"))).find(|path| !path.exists()).expect("numbers go on")
+    }
+
+    /// The folder itself.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// A file in the folder.
+    pub fn file(&self, name: &str) -> PathBuf {
+        self.path.join(name)
+    }
+
+    /// The best model.
+    pub fn model(&self) -> PathBuf {
+        self.file("model.safetensors")
+    }
+
+    pub(super) fn write_json(&self, name: &str, value: &impl Serialize) -> Result<()> {
+        let path = self.file(name);
+        let text = serde_json::to_string_pretty(value).map_err(|e| Error::data(&path, e.to_string()))?;
+        atomic_file::write(&path, (text + "\n").as_bytes())
+    }
+
+    pub(super) fn read_json<T: DeserializeOwned>(&self, name: &str) -> Result<T> {
+        let path = self.file(name);
+        let text = std::fs::read_to_string(&path).map_err(Error::io(&path))?;
+        serde_json::from_str(&text).map_err(|e| Error::data_at(&path, e.line() as u64, e.to_string()))
+    }
+
+    pub(super) fn write_recipe(&self, recipe: &Recipe) -> Result<()> {
+        atomic_file::write(&self.file("recipe.toml"), recipe.to_toml().as_bytes())
+    }
+
+    pub(super) fn read_recipe(&self) -> Result<Recipe> {
+        Recipe::find(&self.file("recipe.toml").display().to_string(), &[])
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_folder_with_something_in_it_is_refused_and_left_alone() {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::write(folder.path().join("mine.txt"), "x").unwrap();
+        let error = RunFolder::create(folder.path()).unwrap_err().to_string();
+        assert!(error.contains("is not empty and stays as it is"), "{error}");
+        assert!(folder.path().join("mine.txt").exists());
+        assert!(RunFolder::create(&folder.path().join("new")).is_ok());
+    }
+
+    #[test]
+    fn what_is_no_run_folder_cannot_be_opened() {
+        let folder = tempfile::tempdir().unwrap();
+        assert!(RunFolder::open(folder.path()).unwrap_err().to_string().ends_with("it has no run.json"));
+    }
+}

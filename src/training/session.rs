@@ -1,0 +1,405 @@
+//! A training run from recordings to model files, and how it goes on after a stop.
+
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Instant;
+
+use serde::{Deserialize, Serialize};
+use steersman_kernels::Isa;
+
+use super::checkpoint::{Progress, State};
+use super::history::{EpochRecord, write_history};
+use super::run_folder::{RunFolder, RunInfo};
+use super::validation::{Validation, ValidationResult};
+use crate::dataset::{Batch, Data, LeakAudit, Loader};
+use crate::error::{Error, Result};
+use crate::model_file::{Model, TrainingRecord, weights_hash};
+use crate::network::{Network, StepInput, TrainingPlan};
+use crate::optimizer::Optimizer;
+use crate::recipe::Recipe;
+
+/// What to train on, and how.
+#[derive(Clone, Debug)]
+pub struct TrainRequest {
+    /// Udacity logs or donkeycar tubs.
+    pub recordings: Vec<PathBuf>,
+    /// The experiment.
+    pub recipe: Recipe,
+    /// Run folder; must not exist or be empty.
+    pub out: PathBuf,
+    /// Seed of all random choices.
+    pub seed: u64,
+    /// Memory for decoded images in MiB; what does not fit goes to a temporary file.
+    pub cache_mib: usize,
+}
+
+/// Whoever watches a run. All methods are called from the training thread.
+pub trait Observer {
+    /// Something the user should know.
+    fn notice(&mut self, text: &str);
+    /// Images of epoch `epoch` (from 1) that are done, of how many.
+    fn progress(&mut self, epoch: u32, images: usize, of: usize);
+    /// An epoch is done, of how many.
+    fn epoch(&mut self, record: &EpochRecord, of: u32);
+}
+
+/// What a run came to; `train --json` prints it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TrainResult {
+    /// Path of the best model.
+    pub model: PathBuf,
+    /// Epochs done.
+    pub epochs: u32,
+    /// The epoch of the best model, from 1.
+    pub best_epoch: u32,
+    /// Mean loss over the last epoch's training batches.
+    pub train_mse: f64,
+    /// Of the best epoch: mean squared error over all validation images.
+    pub val_mse: Option<f64>,
+    /// Of the best epoch: the same over the centre camera's images.
+    pub val_center_mse: Option<f64>,
+    /// Of the best epoch: mean absolute error over the centre camera's images, in degrees of the front wheels.
+    pub val_mae_deg: Option<f64>,
+    /// Of the best epoch: `val_center_mse` ÷ mean squared label.
+    pub relative_to_zero: Option<f64>,
+    /// Training images an epoch.
+    pub train_images: usize,
+    /// Validation images.
+    pub val_images: usize,
+    /// Wall time of the run, interruptions left out.
+    pub seconds: f64,
+    /// Training images a second while training, validation left out.
+    pub images_per_second: f64,
+    /// Over all tensors of the last model.
+    pub weights_hash: String,
+    /// Share of validation frames with a training frame of the same session within a second, in percent.
+    pub leak_percent: f64,
+}
+
+/// Trains anew. Call it inside a rayon pool; `stop` ends it after the current batch.
+///
+/// # Errors
+///
+/// [`Error::Data`] and [`Error::Io`] for recordings that cannot be used, [`Error::Usage`] for a folder that is not empty or
+/// a run that diverges, [`Error::Interrupted`] after saving if `stop` is set.
+pub fn train(request: TrainRequest, observer: &mut dyn Observer, stop: &AtomicBool) -> Result<TrainResult> {
+    let started = Instant::now();
+    let TrainRequest { recordings, recipe, out, seed, cache_mib } = request;
+    let data = Data::prepare(&recordings, &recipe, seed, cache_mib)?;
+    let folder = RunFolder::create(&out)?;
+    folder.write_recipe(&recipe)?;
+    let absolute = |path: &PathBuf| std::path::absolute(path).map_err(Error::io(path));
+    let info = RunInfo {
+        version: env!("CARGO_PKG_VERSION").into(),
+        isa: Isa::best().name().into(),
+        seed,
+        recordings: recordings.iter().map(absolute).collect::<Result<_>>()?,
+        cache_mib,
+        rows_hash: data.rows_hash(),
+    };
+    data.write_split(&folder.file("split.csv"))?;
+    folder.write_json("run.json", &info)?;
+    Session::new(folder, info, recipe, data, started)?.run(observer, stop)
+}
+
+/// Goes on with the run in `path`, as if it had never stopped; prints the result again if it is finished.
+///
+/// # Errors
+///
+/// As [`train`]; [`Error::Data`] also for damaged run folders and recordings that have changed.
+pub fn resume(path: &Path, observer: &mut dyn Observer, stop: &AtomicBool) -> Result<TrainResult> {
+    let started = Instant::now();
+    let folder = RunFolder::open(path)?;
+    if folder.file("result.json").is_file() {
+        observer.notice("this run is finished; here is its result again");
+        let result: TrainResult = folder.read_json("result.json")?;
+        return Ok(TrainResult { model: folder.model(), ..result });
+    }
+    let info: RunInfo = folder.read_json("run.json")?;
+    let recipe = folder.read_recipe()?;
+    let isa = Isa::best().name();
+    if info.isa != isa {
+        observer.notice(&format!(
+            "the run began with {} vector code and goes on with {isa}: the last bits will differ; STEERSMAN_ISA={} \
+             keeps them, where the machine has it",
+            info.isa, info.isa
+        ));
+    }
+    let data = Data::prepare(&info.recordings, &recipe, info.seed, info.cache_mib)?;
+    if data.rows_hash() != info.rows_hash {
+        let message = "the recordings have changed since the run began; it can only go on with the same rows";
+        return Err(Error::data(folder.file("run.json"), message));
+    }
+    let mut session = Session::new(folder, info, recipe, data, started)?;
+    session.restore()?;
+    session.run(observer, stop)
+}
+
+struct Session {
+    folder: RunFolder,
+    info: RunInfo,
+    recipe: Recipe,
+    network: Network,
+    plan: TrainingPlan,
+    training: Loader,
+    training_rows: Vec<u64>,
+    validation: Option<Validation>,
+    leak: LeakAudit,
+    notices: Vec<String>,
+    state: State,
+    started: Instant,
+}
+
+impl Session {
+    fn new(folder: RunFolder, info: RunInfo, recipe: Recipe, data: Data, started: Instant) -> Result<Session> {
+        let network = recipe.network(Isa::best())?;
+        let optimizer = Optimizer::new(recipe.optimizer, recipe.clip_gradient_norm, &network);
+        let parameters = network.initialize(info.seed);
+        let (leak, notices, training_rows) = (data.leak_audit(), data.notices(), data.training_row_ids());
+        let (training, validation) = data.into_loaders()?;
+        Ok(Session {
+            plan: TrainingPlan::new(&network, recipe.batch),
+            validation: validation.map(|loader| Validation::new(loader, &network, recipe.full_lock_deg)),
+            state: State { parameters, optimizer, best: None, progress: Progress::default() },
+            folder,
+            info,
+            recipe,
+            network,
+            training,
+            training_rows,
+            leak,
+            notices,
+            started,
+        })
+    }
+
+    /// Takes the state over from the last checkpoint, if there is one.
+    fn restore(&mut self) -> Result<()> {
+        let path = self.folder.file("checkpoint.safetensors");
+        if path.is_file() {
+            self.state = State::load(&path, &self.network, self.state.optimizer.clone())?;
+        }
+        Ok(())
+    }
+
+    fn run(mut self, observer: &mut dyn Observer, stop: &AtomicBool) -> Result<TrainResult> {
+        for notice in &self.notices {
+            observer.notice(notice);
+        }
+        let seconds_before = self.state.progress.seconds;
+        let mut batches = [Batch::default(), Batch::default()];
+        while self.state.progress.epoch < self.recipe.epochs && !self.stop_early() {
+            let epoch_started = Instant::now();
+            let learning_rate = self.train_epoch(&mut batches, observer, stop, seconds_before)?;
+            let validation = match &mut self.validation {
+                Some(validation) => validation.run(&self.network, &self.state.parameters)?,
+                None => None,
+            };
+            self.end_epoch(learning_rate, validation, epoch_started, observer);
+            self.state.progress.seconds = seconds_before + self.started.elapsed().as_secs_f64();
+            write_history(&self.folder.file("history.csv"), &self.state.progress.history)?;
+            self.save_checkpoint()?;
+        }
+        self.report_damaged(observer);
+        self.finish()
+    }
+
+    /// Trains the rest of the epoch under way; returns the last learning rate.
+    fn train_epoch(
+        &mut self,
+        [current, next]: &mut [Batch; 2],
+        observer: &mut dyn Observer,
+        stop: &AtomicBool,
+        seconds_before: f64,
+    ) -> Result<f64> {
+        let epoch = self.state.progress.epoch;
+        let seconds_of_epoch_before = self.state.progress.train_seconds;
+        let started = Instant::now();
+        self.training.begin_epoch(epoch);
+        let batches = self.training.batches();
+        let updates_in_all = batches as u64 * u64::from(self.recipe.epochs);
+        let mut learning_rate = self.learning_rate(updates_in_all);
+        if self.state.progress.next_batch < batches {
+            self.training.fill(self.state.progress.next_batch, current)?;
+        }
+        while self.state.progress.next_batch < batches {
+            let batch = self.state.progress.next_batch;
+            let (training, following) = (&self.training, batch + 1);
+            let step = u64::from(epoch) * batches as u64 + batch as u64;
+            let State { parameters, optimizer, progress, .. } = &mut self.state;
+            let (network, plan, loss) = (&self.network, &mut self.plan, &self.recipe.loss);
+            // While the network learns from one batch, the next one is prepared.
+            let (mean_loss, filled) = rayon::join(
+                || {
+                    if current.n == 0 {
+                        return 0.0;
+                    }
+                    let input = StepInput { x: &current.x, labels: &current.labels, seed: self.info.seed, step };
+                    plan.step(network, parameters, loss, input)
+                },
+                || if following < batches { training.fill(following, next) } else { Ok(()) },
+            );
+            filled?;
+            if !mean_loss.is_finite() {
+                return Err(Error::Usage(format!(
+                    "training diverged in epoch {}: the loss is {mean_loss}. Try a smaller learning rate, as in --set \
+                     optimizer.learning_rate={:e}",
+                    epoch + 1,
+                    self.recipe.optimizer.learning_rate() / 10.0
+                )));
+            }
+            if current.n > 0 {
+                let fraction = self.recipe.schedule.fraction(optimizer.updates, updates_in_all, &progress.plateau);
+                learning_rate = self.recipe.optimizer.learning_rate() * fraction;
+                let norm = plan.gradient_norm();
+                optimizer.step(learning_rate, &mut parameters.values, plan.gradient_mut(), norm);
+            }
+            progress.loss_sum += mean_loss * current.n as f64;
+            progress.images += current.n;
+            progress.next_batch = following;
+            progress.train_seconds = seconds_of_epoch_before + started.elapsed().as_secs_f64();
+            observer.progress(epoch + 1, progress.images, training.images());
+            std::mem::swap(current, next);
+            if stop.load(Ordering::Relaxed) {
+                self.state.progress.seconds = seconds_before + self.started.elapsed().as_secs_f64();
+                self.save_checkpoint()?;
+                return Err(Error::Interrupted);
+            }
+        }
+        Ok(learning_rate)
+    }
+
+    fn learning_rate(&self, updates_in_all: u64) -> f64 {
+        let State { optimizer, progress, .. } = &self.state;
+        let fraction = self.recipe.schedule.fraction(optimizer.updates, updates_in_all, &progress.plateau);
+        self.recipe.optimizer.learning_rate() * fraction
+    }
+
+    fn end_epoch(
+        &mut self,
+        learning_rate: f64,
+        validation: Option<ValidationResult>,
+        started: Instant,
+        observer: &mut dyn Observer,
+    ) {
+        let State { parameters, best, progress, .. } = &mut self.state;
+        let record = EpochRecord {
+            epoch: progress.epoch + 1,
+            train_loss: progress.loss_sum / progress.images.max(1) as f64,
+            val_mse: validation.map(|v| v.mse),
+            val_center_mse: validation.map(|v| v.center_mse),
+            val_mae_deg: validation.map(|v| v.mae_deg),
+            relative_to_zero: validation.and_then(|v| v.relative_to_zero),
+            learning_rate,
+            images: progress.images,
+            train_seconds: progress.train_seconds,
+            seconds: started.elapsed().as_secs_f64().max(progress.train_seconds),
+        };
+        progress.history.push(record);
+        progress.epoch += 1;
+        (progress.next_batch, progress.loss_sum, progress.images, progress.train_seconds) = (0, 0.0, 0, 0.0);
+
+        // Without a validation side the latest weights are the best there are.
+        let better = match (record.val_mse, progress.best_val_mse) {
+            (Some(now), Some(before)) => now < before,
+            _ => true,
+        };
+        if better {
+            progress.best_val_mse = record.val_mse;
+            progress.best_epoch = record.epoch;
+            best.get_or_insert_with(|| parameters.clone()).clone_from(parameters);
+        }
+        if let Some(now) = record.val_mse {
+            self.recipe.schedule.end_epoch(now, &mut progress.plateau);
+            let min_delta = self.recipe.early_stopping.map_or(0.0, |stopping| stopping.min_delta);
+            if progress.improved_val_mse.is_none_or(|before| now < before - min_delta) {
+                progress.improved_val_mse = Some(now);
+                progress.epochs_since_improvement = 0;
+            } else {
+                progress.epochs_since_improvement += 1;
+            }
+        }
+        observer.epoch(&record, self.recipe.epochs);
+    }
+
+    fn stop_early(&self) -> bool {
+        let patience = self.recipe.early_stopping.map(|stopping| stopping.patience_epochs.max(1));
+        patience.is_some_and(|patience| self.state.progress.epochs_since_improvement >= patience)
+    }
+
+    fn save_checkpoint(&self) -> Result<()> {
+        self.state.save(&self.folder.file("checkpoint.safetensors"), &self.network)?;
+        if let Some(best) = &self.state.best {
+            let progress = &self.state.progress;
+            self.model(best, progress.best_epoch).save(&self.folder.model())?;
+            let last = progress.history.len() as u32;
+            // In the middle of an epoch the weights belong to no epoch's figures; the checkpoint has them.
+            if progress.next_batch == 0 {
+                self.model(&self.state.parameters, last).save(&self.folder.file("last.safetensors"))?;
+            }
+        }
+        Ok(())
+    }
+
+    /// The weights after `epoch` (from 1) as a model.
+    fn model(&self, parameters: &crate::network::Parameters, epoch: u32) -> Model {
+        let record = self.state.progress.history[epoch as usize - 1];
+        Model {
+            recipe: self.recipe.clone(),
+            parameters: parameters.clone(),
+            record: TrainingRecord {
+                version: env!("CARGO_PKG_VERSION").into(),
+                isa: self.network.isa().name().into(),
+                seed: self.info.seed,
+                recordings: self.info.recordings.iter().map(|path| path.display().to_string()).collect(),
+                epochs: epoch,
+                train_loss: record.train_loss,
+                val_mse: record.val_mse,
+                val_center_mse: record.val_center_mse,
+                leak_percent: self.leak.within_a_second_percent,
+            },
+            training_rows: self.training_rows.clone(),
+        }
+    }
+
+    fn report_damaged(&self, observer: &mut dyn Observer) {
+        let damaged = self.training.damaged().into_iter().chain(self.validation.iter().flat_map(|v| v.damaged()));
+        for image in damaged {
+            observer.notice(&format!("left out, it cannot be decoded: {image}"));
+        }
+    }
+
+    fn finish(mut self) -> Result<TrainResult> {
+        if self.recipe.early_stopping.is_some()
+            && let Some(best) = &self.state.best
+        {
+            self.state.parameters.clone_from(best);
+        }
+        let progress = &self.state.progress;
+        let best = progress.history[progress.best_epoch as usize - 1];
+        let last = progress.history[progress.history.len() - 1];
+        let (images, seconds) = progress.history.iter().fold((0, 0.0), |(images, seconds), epoch| {
+            (images + epoch.images, seconds + epoch.train_seconds)
+        });
+        let result = TrainResult {
+            model: self.folder.model(),
+            epochs: last.epoch,
+            best_epoch: best.epoch,
+            train_mse: last.train_loss,
+            val_mse: best.val_mse,
+            val_center_mse: best.val_center_mse,
+            val_mae_deg: best.val_mae_deg,
+            relative_to_zero: best.relative_to_zero,
+            train_images: self.training.images(),
+            val_images: self.validation.as_ref().map_or(0, Validation::images),
+            seconds: progress.seconds,
+            images_per_second: images as f64 / seconds,
+            weights_hash: weights_hash(&self.network, &self.state.parameters),
+            leak_percent: self.leak.within_a_second_percent,
+        };
+        self.save_checkpoint()?;
+        self.folder.write_json("result.json", &result)?;
+        Ok(result)
+    }
+}

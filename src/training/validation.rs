@@ -1,0 +1,95 @@
+//! The held-out side, after each epoch.
+
+use crate::dataset::{Batch, Camera, Loader};
+use crate::error::Result;
+use crate::network::{InferencePlan, Network, Parameters};
+
+/// How the network does on the validation side.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ValidationResult {
+    /// Mean squared error over all validation images.
+    pub mse: f64,
+    /// Mean squared error over the images of the centre camera, not mirrored; the fields below are of the same images.
+    pub center_mse: f64,
+    /// Mean absolute error in degrees of the front wheels.
+    pub mae_deg: f64,
+    /// `center_mse` ÷ mean squared label; absent if all labels are zero.
+    pub relative_to_zero: Option<f64>,
+}
+
+/// The validation side with its buffers.
+#[derive(Debug)]
+pub struct Validation {
+    loader: Loader,
+    plan: InferencePlan,
+    batches: [Batch; 2],
+    predictions: Vec<f32>,
+    full_lock_deg: f64,
+}
+
+impl Validation {
+    /// Validates on the images of `loader`.
+    pub fn new(loader: Loader, network: &Network, full_lock_deg: f64) -> Validation {
+        let capacity = loader.batch_size();
+        Validation {
+            plan: InferencePlan::new(network, capacity),
+            batches: [Batch::default(), Batch::default()],
+            predictions: vec![0.0; capacity],
+            loader,
+            full_lock_deg,
+        }
+    }
+
+    /// Number of images.
+    pub fn images(&self) -> usize {
+        self.loader.images()
+    }
+
+    /// Images that turned out to be damaged.
+    pub fn damaged(&self) -> Vec<String> {
+        self.loader.damaged()
+    }
+
+    /// Runs the network over the whole side. `None` if no image can be read.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Io`](crate::Error::Io) if the image cache fails.
+    pub fn run(&mut self, network: &Network, parameters: &Parameters) -> Result<Option<ValidationResult>> {
+        let Validation { loader, plan, batches: [current, next], predictions, full_lock_deg } = self;
+        let (mut squares, mut images) = (0.0, 0usize);
+        let (mut center_squares, mut center_absolute, mut label_squares, mut center_images) = (0.0, 0.0, 0.0, 0usize);
+        loader.fill(0, current)?;
+        for batch in 0..loader.batches() {
+            // While the network looks at one batch, the next one is prepared.
+            let predictions = &mut predictions[..current.n];
+            let ((), filled) = rayon::join(
+                || plan.run(network, parameters, &current.x, predictions),
+                || if batch + 1 < loader.batches() { loader.fill(batch + 1, next) } else { Ok(()) },
+            );
+            filled?;
+            for ((sample, label), prediction) in current.samples.iter().zip(&current.labels).zip(predictions) {
+                let (label, error) = (f64::from(*label), f64::from(*prediction) - f64::from(*label));
+                squares += error * error;
+                images += 1;
+                if sample.camera == Camera::Centre && !sample.mirrored {
+                    center_squares += error * error;
+                    center_absolute += error.abs();
+                    label_squares += label * label;
+                    center_images += 1;
+                }
+            }
+            std::mem::swap(current, next);
+        }
+        if images == 0 {
+            return Ok(None);
+        }
+        let center = center_images.max(1) as f64;
+        Ok(Some(ValidationResult {
+            mse: squares / images as f64,
+            center_mse: center_squares / center,
+            mae_deg: center_absolute / center * *full_lock_deg,
+            relative_to_zero: (label_squares > 0.0).then(|| center_squares / label_squares),
+        }))
+    }
+}
