@@ -19,14 +19,16 @@ use input_gradient::InputGradient;
 use prepare::Layout;
 pub use shape::ConvShape;
 
-/// Elements of copied images that are worked on at a time: 256 KiB leaves room in the second-level cache.
-const COPY_BUDGET: usize = 1 << 16;
+/// Elements of copied images that the forward pass works on at a time: 256 KiB leaves room in the second-level cache.
+const FORWARD_COPIES: usize = 1 << 16;
+/// The same for the weight gradient: 2 MiB. It sums over lanes once a group, so groups should be large.
+const GRADIENT_COPIES: usize = 1 << 19;
 /// The most lanes a vector has; copies end in as many zeros, so that whole vectors may be read.
 const MOST_LANES: usize = 16;
 
-/// How many images of `image` elements are copied at a time.
-fn group_of(image: usize) -> usize {
-    (COPY_BUDGET / image.max(1)).clamp(1, 8)
+/// How many images of `image` elements are copied at a time, within a budget of elements.
+fn group_of(image: usize, budget: usize) -> usize {
+    (budget / image.max(1)).clamp(1, 8)
 }
 
 /// A convolution of one shape on one instruction set, with the tables of each pass worked out.
@@ -53,6 +55,8 @@ impl Conv {
         let layout = Layout::new(shape);
         let sum = TapSum {
             taps: layout.taps(),
+            weights: (0..shape.taps()).collect(),
+            weight_stride: shape.taps(),
             spans: grid::spans(shape.out_h(), shape.out_w(), layout.pitch, isa.lanes()),
             origin: 0,
             in_image: layout.image(),
@@ -75,14 +79,15 @@ impl Conv {
 
     /// Elements of `scratch` that are enough for every pass, whatever the number of images.
     pub fn scratch_len(&self) -> usize {
-        let weight_gradient = self.copy_len() + weight_gradient::scratch_len(self.shape.taps());
-        let forward = self.copy_len() + self.sum.packed_len();
+        let weight_gradient = self.copy_len(GRADIENT_COPIES) + weight_gradient::scratch_len(self.shape.taps());
+        let forward = self.copy_len(FORWARD_COPIES) + self.sum.packed_len();
         forward.max(weight_gradient).max(self.input_gradient.scratch_len())
     }
 
     /// Elements of the copied images of a group.
-    fn copy_len(&self) -> usize {
-        if self.layout.copies { group_of(self.layout.image()) * self.layout.image() + MOST_LANES } else { 0 }
+    fn copy_len(&self, budget: usize) -> usize {
+        let image = self.layout.image();
+        if self.layout.copies { group_of(image, budget) * image + MOST_LANES } else { 0 }
     }
 
     /// Checks the lengths that all passes share; `true` if there is anything to compute.
@@ -160,14 +165,13 @@ per_isa! {
         y: &mut [f32],
         scratch: &mut [f32],
     ) {
-        let (copy, packed) = scratch.split_at_mut(conv.copy_len());
-        let (sum, taps) = (&conv.sum, conv.sum.taps.len());
-        let height = direct::tile_height(S::MANY_REGISTERS, sum.channels);
-        sum.pack(height, |o| bias[o], |o, k| weight[o * taps + k], packed);
+        let (copy, packed) = scratch.split_at_mut(conv.copy_len(FORWARD_COPIES));
+        let sum = &conv.sum;
+        sum.pack(direct::tile_height(S::MANY_REGISTERS, sum.channels), Some(bias), weight, packed);
         if !conv.layout.copies {
             return sum.run(simd, x, packed, y);
         }
-        let group = group_of(conv.layout.image());
+        let group = group_of(conv.layout.image(), FORWARD_COPIES);
         let groups = x.chunks(group * conv.shape.x_len().max(1)).zip(y.chunks_mut(group * conv.shape.y_len()));
         for (x, y) in groups {
             let used = y.len() / conv.shape.y_len() * conv.layout.image();
@@ -188,11 +192,11 @@ per_isa! {
         dbias: &mut [f32],
         scratch: &mut [f32],
     ) {
-        let (copy, scratch) = scratch.split_at_mut(conv.copy_len());
+        let (copy, scratch) = scratch.split_at_mut(conv.copy_len(GRADIENT_COPIES));
         if !conv.layout.copies {
             return weight_gradient::run(simd, &conv.sum, x, dy, dweight, dbias, scratch);
         }
-        let group = group_of(conv.layout.image());
+        let group = group_of(conv.layout.image(), GRADIENT_COPIES);
         let groups = x.chunks(group * conv.shape.x_len().max(1)).zip(dy.chunks(group * conv.shape.y_len()));
         for (x, dy) in groups {
             let used = dy.len() / conv.shape.y_len() * conv.layout.image();

@@ -6,7 +6,7 @@
 //! phases are computed side by side in scratch and woven into `dx`.
 
 use super::direct::{TapSum, tile_height};
-use super::{ConvShape, MOST_LANES, grid, group_of};
+use super::{ConvShape, FORWARD_COPIES, MOST_LANES, grid, group_of};
 use crate::Isa;
 
 /// The rows, or columns, of the input that leave one remainder.
@@ -59,18 +59,22 @@ impl InputGradient {
         let mut parts = Vec::new();
         for &rows in &all_rows {
             for &columns in &all_columns {
-                let mut taps = Vec::with_capacity(oc * rows.taps * columns.taps);
+                let (mut taps, mut weights) = (Vec::new(), Vec::new());
                 for o in 0..oc {
                     for j in 0..rows.taps {
                         for i in 0..columns.taps {
                             let (up, left) = (rows.taps - 1 - j, columns.taps - 1 - i);
                             taps.push((o * padded.0 + up) * padded.1 + left);
+                            let (ky, kx) = (rows.remainder + j * stride_h, columns.remainder + i * stride_w);
+                            weights.push((o * c * kh + ky) * kw + kx);
                         }
                     }
                 }
                 let (top, left) = (before.0 + 1 - rows.taps, before.1 + 1 - columns.taps);
                 let sum = TapSum {
                     taps,
+                    weights,
+                    weight_stride: kh * kw,
                     spans: grid::spans(rows.count, columns.count, padded.1, isa.lanes()),
                     origin: (rows.first + top) * padded.1 + columns.first + left,
                     in_image: oc * padded.0 * padded.1,
@@ -101,7 +105,7 @@ impl InputGradient {
     }
 
     pub fn scratch_len(&self) -> usize {
-        let group = group_of(self.image());
+        let group = group_of(self.image(), FORWARD_COPIES);
         let (packed, phase) = self.part_lens();
         group * (self.image() + phase) + MOST_LANES + packed
     }
@@ -154,8 +158,8 @@ per_isa! {
         dx: &mut [f32],
         scratch: &mut [f32],
     ) {
-        let ConvShape { c, kh, kw, stride_h, stride_w, .. } = gradient.shape;
-        let group = group_of(gradient.image());
+        let c = gradient.shape.c;
+        let group = group_of(gradient.image(), FORWARD_COPIES);
         let (packed_len, phase_len) = gradient.part_lens();
         let (packed, scratch) = scratch.split_at_mut(packed_len);
         let (phase, copy) = scratch.split_at_mut(group * phase_len);
@@ -165,14 +169,7 @@ per_isa! {
         for part in &gradient.parts {
             let (to, after) = rest.split_at_mut(part.sum.packed_len());
             rest = after;
-            let (rows, columns) = (part.rows, part.columns);
-            let per_channel = rows.taps * columns.taps;
-            let turned = |channel: usize, k: usize| {
-                let (o, j, i) = (k / per_channel, k % per_channel / columns.taps, k % columns.taps);
-                let (ky, kx) = (rows.remainder + j * stride_h, columns.remainder + i * stride_w);
-                weight[((o * c + channel) * kh + ky) * kw + kx]
-            };
-            part.sum.pack(height, |_| 0.0, turned, to);
+            part.sum.pack(height, None, weight, to);
         }
 
         // Input that no window touches keeps this zero; with stride 1 the single part writes everything.

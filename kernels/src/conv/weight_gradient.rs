@@ -81,7 +81,8 @@ fn run_height<S: Simd, const MR: usize>(
                     // `CHUNK * MR` vectors.
                     unsafe {
                         let from = dy.as_ptr().add(image * image_len + (first + r) * sum.plane + span.out);
-                        let values = simd.load_spread(from, span.lanes);
+                        let full = span.lanes == (1 << S::LANES) - 1;
+                        let values = if full { simd.load(from) } else { simd.load_spread(from, span.lanes) };
                         simd.store(packed.as_mut_ptr().add((i * MR + r) * S::LANES), values);
                         bias[r] = simd.mul_add(values, simd.splat(1.0), bias[r]);
                     }
