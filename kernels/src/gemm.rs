@@ -1,6 +1,6 @@
 //! Matrix product, packed into panels and cut into blocks for the caches (Goto and van de Geijn 2008).
 
-use crate::simd::Simd;
+use crate::simd::{ALIGNMENT, Simd, align};
 
 /// Depth of a block: a panel of `A` and one of `B` of this depth stay in the first-level cache.
 const BLOCK_K: usize = 256;
@@ -20,7 +20,7 @@ pub fn gemm_scratch_len(m: usize, k: usize, n: usize) -> usize {
     let depth = k.min(BLOCK_K);
     let a = |m: usize| m.min(BLOCK_M).next_multiple_of(MOST_ROWS) * depth;
     let b = |n: usize| n.min(BLOCK_N).next_multiple_of(MOST_COLUMNS) * depth;
-    (a(m) + b(n)).max(a(n) + b(m))
+    (a(m) + b(n)).max(a(n) + b(m)) + ALIGNMENT
 }
 
 /// `C = alpha A B + beta C`.
@@ -101,7 +101,7 @@ fn blocks_of<S: Simd, const MR: usize>(
     scratch: &mut [f32],
 ) {
     let columns = S::LANES * TILE_VECTORS;
-    let (packed_b, packed_a) = scratch.split_at_mut(n.min(BLOCK_N).next_multiple_of(columns) * k.min(BLOCK_K));
+    let (packed_b, packed_a) = align(scratch).split_at_mut(n.min(BLOCK_N).next_multiple_of(columns) * k.min(BLOCK_K));
     for first_n in (0..n).step_by(BLOCK_N) {
         let block_n = BLOCK_N.min(n - first_n);
         // A product over nothing still scales C: one empty block.
@@ -153,14 +153,13 @@ fn pack(
                 to[count..].fill(0.0);
             }
         } else {
-            for i in 0..count {
-                let steps = from[i * stride..].iter().step_by(step_stride.max(1));
-                for (to, &value) in to[i..].iter_mut().step_by(width).zip(steps) {
+            // Step by step, so that writes are contiguous and the `count` reads walk along as many cache lines.
+            for (step, to) in to.chunks_exact_mut(width).enumerate() {
+                let from = from[step * step_stride..].iter().step_by(stride.max(1));
+                for (to, &value) in to[..count].iter_mut().zip(from) {
                     *to = value;
                 }
-            }
-            for i in count..width {
-                to[i..].iter_mut().step_by(width).for_each(|to| *to = 0.0);
+                to[count..].fill(0.0);
             }
         }
     }

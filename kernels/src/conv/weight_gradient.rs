@@ -6,7 +6,7 @@
 //! run over it; the sums of a panel of channels wait in scratch meanwhile.
 
 use super::direct::{TapSum, tile_height};
-use crate::simd::Simd;
+use crate::simd::{ALIGNMENT, Simd, align};
 
 /// Taps in a tile.
 const TILE_TAPS: usize = 3;
@@ -18,7 +18,7 @@ const MOST_CHANNELS: usize = 8;
 
 /// Elements of scratch for `taps` taps.
 pub(crate) fn scratch_len(taps: usize) -> usize {
-    (CHUNK * MOST_CHANNELS + taps.next_multiple_of(TILE_TAPS) * MOST_CHANNELS) * MOST_LANES
+    (CHUNK * MOST_CHANNELS + taps.next_multiple_of(TILE_TAPS) * MOST_CHANNELS) * MOST_LANES + ALIGNMENT
 }
 
 /// Adds the gradient of the images in `dy` to `dweight` and `dbias`.
@@ -57,9 +57,10 @@ fn run_height<S: Simd, const MR: usize>(
     let images = dy.len() / image_len;
     sum.check::<S>(images, x.len(), dy.len());
     assert!(dweight.len() == sum.channels * taps && dbias.len() == sum.channels, "weight gradient: wrong length");
-    let (packed, sums) = scratch.split_at_mut(CHUNK * MR * S::LANES);
+    let (packed, sums) = align(scratch).split_at_mut(CHUNK * MR * S::LANES);
     let sums = &mut sums[..taps.next_multiple_of(TILE_TAPS) * MR * S::LANES];
     let total = images * sum.spans.len();
+    let farthest = sum.farthest();
 
     for first in (0..sum.channels).step_by(MR) {
         let rows = MR.min(sum.channels - first);
@@ -75,7 +76,7 @@ fn run_height<S: Simd, const MR: usize>(
                 let span = sum.spans[(chunk + i) % sum.spans.len()];
                 starts[i] = image * sum.in_image + sum.origin + span.start;
                 // Vectors come in ascending order: only the last ones of the last image may end outside `x`.
-                whole += usize::from(starts[i] + sum.farthest() + S::LANES <= x.len());
+                whole += usize::from(starts[i] + farthest + S::LANES <= x.len());
                 for r in 0..rows {
                     // SAFETY: the plane of an output channel holds the outputs of every span (`check`); `packed` holds
                     // `CHUNK * MR` vectors.
