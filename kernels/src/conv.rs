@@ -1,21 +1,75 @@
 //! Convolution and its gradients.
+//!
+//! | pass | algorithm |
+//! |---|---|
+//! | forward | a sum over taps with vectors along the output rows ([`direct`]), of the image itself when the stride is 1 and nothing is padded, else of a copy that is padded and split into phases ([`prepare`]) |
+//! | input gradient | for each phase of the input the same sum over the zero-padded output gradient, with the kernel turned round ([`input_gradient`]) |
+//! | weight gradient | vectors along the output rows, summed over lanes at the end ([`weight_gradient`]) |
 
+mod direct;
+mod grid;
+mod input_gradient;
+mod prepare;
 mod shape;
+mod weight_gradient;
 
 use crate::Isa;
+use direct::TapSum;
+use input_gradient::InputGradient;
+use prepare::Layout;
 pub use shape::ConvShape;
 
-/// A convolution of one shape on one instruction set, with the algorithm of each pass chosen.
+/// Elements of copied images that the forward pass works on at a time: 256 KiB leaves room in the second-level cache.
+const FORWARD_COPIES: usize = 1 << 16;
+/// The same for the weight gradient: 2 MiB. It sums over lanes once a group, so groups should be large.
+const GRADIENT_COPIES: usize = 1 << 19;
+/// The most lanes a vector has; copies end in as many zeros, so that whole vectors may be read.
+const MOST_LANES: usize = 16;
+
+/// How many images of `image` elements are copied at a time, within a budget of elements.
+fn group_of(image: usize, budget: usize) -> usize {
+    (budget / image.max(1)).clamp(1, 8)
+}
+
+/// A convolution of one shape on one instruction set, with the tables of each pass worked out.
 #[derive(Clone, Debug)]
 pub struct Conv {
     shape: ConvShape,
     isa: Isa,
+    layout: Layout,
+    sum: TapSum,
+    input_gradient: InputGradient,
 }
 
 impl Conv {
     /// Plans the convolution.
+    ///
+    /// # Panics
+    /// If a size other than the padding is 0.
     pub fn new(shape: ConvShape, isa: Isa) -> Conv {
-        Conv { shape, isa }
+        let ConvShape { c, h, w, oc, kh, kw, stride_h, stride_w, .. } = shape;
+        assert!(
+            [c, h, w, oc, kh, kw, stride_h, stride_w].iter().all(|&size| size > 0),
+            "convolution: every size but the padding must be at least 1 in {shape:?}"
+        );
+        let layout = Layout::new(shape);
+        let sum = TapSum {
+            taps: layout.taps(),
+            weights: (0..shape.taps()).collect(),
+            weight_stride: shape.taps(),
+            spans: grid::spans(shape.out_h(), shape.out_w(), layout.pitch, isa.lanes()),
+            origin: 0,
+            in_image: layout.image(),
+            channels: shape.oc,
+            plane: shape.out_pixels(),
+        };
+        let input_gradient = InputGradient::new(shape, isa);
+        Conv { shape, isa, layout, sum, input_gradient }
+    }
+
+    /// The sizes.
+    pub fn shape(&self) -> &ConvShape {
+        &self.shape
     }
 
     /// The instruction set it runs on.
@@ -23,22 +77,67 @@ impl Conv {
         self.isa
     }
 
-    /// Elements of `scratch` that every pass is content with, whatever the number of images.
+    /// Elements of `scratch` that are enough for every pass, whatever the number of images.
     pub fn scratch_len(&self) -> usize {
-        0
+        let weight_gradient = self.copy_len(GRADIENT_COPIES) + weight_gradient::scratch_len(self.shape.taps());
+        let forward = self.copy_len(FORWARD_COPIES) + self.sum.packed_len();
+        forward.max(weight_gradient).max(self.input_gradient.scratch_len())
     }
 
-    /// `y = conv(x, weight) + bias`, for `n` images; `y` is overwritten.
-    pub fn forward(&self, n: usize, x: &[f32], weight: &[f32], bias: &[f32], y: &mut [f32], _scratch: &mut [f32]) {
-        crate::reference::conv_forward(&self.shape, n, x, weight, bias, y);
+    /// Elements of the copied images of a group.
+    fn copy_len(&self, budget: usize) -> usize {
+        let image = self.layout.image();
+        if self.layout.copies { group_of(image, budget) * image + MOST_LANES } else { 0 }
     }
 
-    /// The gradient with respect to the input; `dx` is overwritten.
-    pub fn backward_input(&self, n: usize, dy: &[f32], weight: &[f32], dx: &mut [f32], _scratch: &mut [f32]) {
-        crate::reference::conv_backward_input(&self.shape, n, dy, weight, dx);
+    /// Checks the lengths that all passes share; `true` if there is anything to compute.
+    fn check(&self, pass: &str, n: usize, x_len: usize, y_len: usize, weight_len: usize, scratch_len: usize) -> bool {
+        let shape = &self.shape;
+        assert_eq!(x_len, n * shape.x_len(), "{pass}: length of the {n} inputs of {shape:?}");
+        assert_eq!(y_len, n * shape.y_len(), "{pass}: length of the {n} outputs of {shape:?}");
+        assert_eq!(weight_len, shape.oc * shape.taps(), "{pass}: length of the weights of {shape:?}");
+        assert!(scratch_len >= self.scratch_len(), "{pass}: scratch must have {} elements", self.scratch_len());
+        y_len > 0
     }
 
-    /// The gradients with respect to weight and bias, added to `dweight` and `dbias`.
+    /// `y = conv(x, weight) + bias` for `n` images; `y` is overwritten.
+    ///
+    /// # Shapes
+    /// `x`: `[n][c][h][w]`, `weight`: `[oc][c][kh][kw]`, `bias`: `[oc]`, `y`: `[n][oc][out_h][out_w]`. The output of
+    /// an image does not depend on the others.
+    ///
+    /// # Panics
+    /// If a slice has another length, or `scratch` less than [`Conv::scratch_len`].
+    pub fn forward(&self, n: usize, x: &[f32], weight: &[f32], bias: &[f32], y: &mut [f32], scratch: &mut [f32]) {
+        let any = self.check("conv forward", n, x.len(), y.len(), weight.len(), scratch.len());
+        assert_eq!(bias.len(), self.shape.oc, "conv forward: length of the bias of {:?}", self.shape);
+        if any {
+            forward(self.isa, self, x, weight, bias, y, scratch);
+        }
+    }
+
+    /// The gradient with respect to the input of `n` images; `dx` is overwritten.
+    ///
+    /// # Shapes
+    /// As for [`Conv::forward`], `dy` like `y` and `dx` like `x`.
+    ///
+    /// # Panics
+    /// If a slice has another length, or `scratch` less than [`Conv::scratch_len`].
+    pub fn backward_input(&self, n: usize, dy: &[f32], weight: &[f32], dx: &mut [f32], scratch: &mut [f32]) {
+        if self.check("conv backward_input", n, dx.len(), dy.len(), weight.len(), scratch.len()) && !dx.is_empty() {
+            input_gradient::run(self.isa, &self.input_gradient, dy, weight, dx, scratch);
+        } else {
+            dx.fill(0.0);
+        }
+    }
+
+    /// The gradients with respect to weight and bias, summed over `n` images and added to `dweight` and `dbias`.
+    ///
+    /// # Shapes
+    /// As for [`Conv::forward`], each gradient like what it is the gradient of.
+    ///
+    /// # Panics
+    /// If a slice has another length, or `scratch` less than [`Conv::scratch_len`].
     pub fn backward_weight(
         &self,
         n: usize,
@@ -46,8 +145,64 @@ impl Conv {
         dy: &[f32],
         dweight: &mut [f32],
         dbias: &mut [f32],
-        _scratch: &mut [f32],
+        scratch: &mut [f32],
     ) {
-        crate::reference::conv_backward_weight(&self.shape, n, x, dy, dweight, dbias);
+        let any = self.check("conv backward_weight", n, x.len(), dy.len(), dweight.len(), scratch.len());
+        assert_eq!(dbias.len(), self.shape.oc, "conv backward_weight: length of the bias of {:?}", self.shape);
+        if any {
+            backward_weight(self.isa, self, x, dy, dweight, dbias, scratch);
+        }
+    }
+}
+
+per_isa! {
+    fn forward<S>(
+        simd: S,
+        conv: &Conv,
+        x: &[f32],
+        weight: &[f32],
+        bias: &[f32],
+        y: &mut [f32],
+        scratch: &mut [f32],
+    ) {
+        let (copy, packed) = scratch.split_at_mut(conv.copy_len(FORWARD_COPIES));
+        let sum = &conv.sum;
+        sum.pack(direct::tile_height(S::MANY_REGISTERS, sum.channels), Some(bias), weight, packed);
+        if !conv.layout.copies {
+            return sum.run(simd, x, packed, y);
+        }
+        let group = group_of(conv.layout.image(), FORWARD_COPIES);
+        let groups = x.chunks(group * conv.shape.x_len().max(1)).zip(y.chunks_mut(group * conv.shape.y_len()));
+        for (x, y) in groups {
+            let used = y.len() / conv.shape.y_len() * conv.layout.image();
+            conv.layout.copy(x, &mut copy[..used]);
+            copy[used..used + MOST_LANES].fill(0.0);
+            sum.run(simd, &copy[..used + MOST_LANES], packed, y);
+        }
+    }
+}
+
+per_isa! {
+    fn backward_weight<S>(
+        simd: S,
+        conv: &Conv,
+        x: &[f32],
+        dy: &[f32],
+        dweight: &mut [f32],
+        dbias: &mut [f32],
+        scratch: &mut [f32],
+    ) {
+        let (copy, scratch) = scratch.split_at_mut(conv.copy_len(GRADIENT_COPIES));
+        if !conv.layout.copies {
+            return weight_gradient::run(simd, &conv.sum, x, dy, dweight, dbias, scratch);
+        }
+        let group = group_of(conv.layout.image(), GRADIENT_COPIES);
+        let groups = x.chunks(group * conv.shape.x_len().max(1)).zip(dy.chunks(group * conv.shape.y_len()));
+        for (x, dy) in groups {
+            let used = dy.len() / conv.shape.y_len() * conv.layout.image();
+            conv.layout.copy(x, &mut copy[..used]);
+            copy[used..used + MOST_LANES].fill(0.0);
+            weight_gradient::run(simd, &conv.sum, &copy[..used + MOST_LANES], dy, dweight, dbias, scratch);
+        }
     }
 }

@@ -1,15 +1,40 @@
-//! Matrix product.
+//! Matrix product, packed into panels and cut into blocks for the caches (Goto and van de Geijn 2008).
 
-use crate::Isa;
+use crate::simd::{ALIGNMENT, Simd, align};
 
-/// Elements of scratch that [`gemm`] needs.
-pub fn gemm_scratch_len(_m: usize, _k: usize, _n: usize) -> usize {
-    0
+/// Depth of a block: a panel of `A` and one of `B` of this depth stay in the first-level cache.
+const BLOCK_K: usize = 256;
+/// Rows of a block of `A`, which stays in the second-level cache (96 KiB).
+const BLOCK_M: usize = 96;
+/// Columns of a block of `B` (480 KiB).
+const BLOCK_N: usize = 480;
+/// Vectors in a tile.
+const TILE_VECTORS: usize = 3;
+/// The largest tile of any instruction set.
+const MOST_ROWS: usize = 8;
+const MOST_COLUMNS: usize = 16 * TILE_VECTORS;
+
+/// Elements of scratch that [`gemm`] needs for an `m x k` times `k x n` product, at most 640 KiB.
+pub fn gemm_scratch_len(m: usize, k: usize, n: usize) -> usize {
+    // A product may be computed as that of the transposes, so either size may take either part.
+    let depth = k.min(BLOCK_K);
+    let a = |m: usize| m.min(BLOCK_M).next_multiple_of(MOST_ROWS) * depth;
+    let b = |n: usize| n.min(BLOCK_N).next_multiple_of(MOST_COLUMNS) * depth;
+    (a(m) + b(n)).max(a(n) + b(m)) + ALIGNMENT
 }
 
 /// `C = alpha A B + beta C`.
+///
+/// # Shapes
+/// `A` is `m x k`, `B` `k x n`, `C` `m x n`. Strides are those of a row and of a column, in elements: `(k, 1)` is a
+/// row-major `m x k` matrix and `(1, m)` the same read as transposed. With `beta = 0`, what `C` holds does not matter.
+/// Each element of `C` is summed in the order of `k`, in blocks of 256.
+///
+/// # Panics
+/// If a slice is shorter than its strides ask for, two elements of `C` share a place, or `scratch` has less than
+/// [`gemm_scratch_len`] elements.
 pub fn gemm(
-    _isa: Isa,
+    isa: crate::Isa,
     m: usize,
     k: usize,
     n: usize,
@@ -21,7 +46,189 @@ pub fn gemm(
     beta: f32,
     c: &mut [f32],
     c_strides: (usize, usize),
-    _scratch: &mut [f32],
+    scratch: &mut [f32],
 ) {
-    crate::reference::gemm((m, k, n), alpha, (a, a_strides), (b, b_strides), beta, (c, c_strides));
+    if m == 0 || n == 0 {
+        return;
+    }
+    let last =
+        |rows: usize, columns: usize, strides: (usize, usize)| (rows - 1) * strides.0 + (columns - 1) * strides.1;
+    assert!(k == 0 || last(m, k, a_strides) < a.len(), "gemm: A is too short");
+    assert!(k == 0 || last(k, n, b_strides) < b.len(), "gemm: B is too short");
+    assert!(last(m, n, c_strides) < c.len(), "gemm: C is too short");
+    let (row, column) = c_strides;
+    let apart = (row >= 1 || m == 1) && (column >= 1 || n == 1);
+    assert!(apart && (row > (n - 1) * column || column > (m - 1) * row), "gemm: elements of C share a place");
+    assert!(scratch.len() >= gemm_scratch_len(m, k, n), "gemm: scratch is too short");
+    if column == 1 || row != 1 {
+        blocks(isa, (m, k, n), alpha, (a, a_strides), (b, b_strides), beta, (c, c_strides), scratch);
+    } else {
+        // The rows of C' are contiguous: C' = B' A'.
+        let turned = |(row, column): (usize, usize)| (column, row);
+        let (a_strides, b_strides) = (turned(a_strides), turned(b_strides));
+        blocks(isa, (n, k, m), alpha, (b, b_strides), (a, a_strides), beta, (c, turned(c_strides)), scratch);
+    }
+}
+
+per_isa! {
+    fn blocks<S>(
+        simd: S,
+        sizes: (usize, usize, usize),
+        alpha: f32,
+        a: (&[f32], (usize, usize)),
+        b: (&[f32], (usize, usize)),
+        beta: f32,
+        c: (&mut [f32], (usize, usize)),
+        scratch: &mut [f32],
+    ) {
+        if S::MANY_REGISTERS {
+            blocks_of::<S, 8>(simd, sizes, alpha, a, b, beta, c, scratch);
+        } else {
+            blocks_of::<S, 4>(simd, sizes, alpha, a, b, beta, c, scratch);
+        }
+    }
+}
+
+#[inline(always)]
+fn blocks_of<S: Simd, const MR: usize>(
+    simd: S,
+    (m, k, n): (usize, usize, usize),
+    alpha: f32,
+    (a, a_strides): (&[f32], (usize, usize)),
+    (b, b_strides): (&[f32], (usize, usize)),
+    beta: f32,
+    (c, c_strides): (&mut [f32], (usize, usize)),
+    scratch: &mut [f32],
+) {
+    let columns = S::LANES * TILE_VECTORS;
+    let (packed_b, packed_a) = align(scratch).split_at_mut(n.min(BLOCK_N).next_multiple_of(columns) * k.min(BLOCK_K));
+    for first_n in (0..n).step_by(BLOCK_N) {
+        let block_n = BLOCK_N.min(n - first_n);
+        // A product over nothing still scales C: one empty block.
+        for first_k in (0..k.max(1)).step_by(BLOCK_K) {
+            let block_k = BLOCK_K.min(k - first_k);
+            let beta = if first_k == 0 { beta } else { 1.0 };
+            let from = (first_k * b_strides.0 + first_n * b_strides.1, b_strides.0, b_strides.1);
+            pack(b, from, block_k, block_n, columns, packed_b);
+            for first_m in (0..m).step_by(BLOCK_M) {
+                let block_m = BLOCK_M.min(m - first_m);
+                let from = (first_m * a_strides.0 + first_k * a_strides.1, a_strides.1, a_strides.0);
+                pack(a, from, block_k, block_m, MR, packed_a);
+                for j in (0..block_n).step_by(columns) {
+                    for i in (0..block_m).step_by(MR) {
+                        let panel_a = &packed_a[i * block_k..][..MR * block_k];
+                        let panel_b = &packed_b[j * block_k..][..columns * block_k];
+                        let tile = tile::<S, MR>(simd, panel_a, panel_b);
+                        let (rows, columns) = (MR.min(block_m - i), columns.min(block_n - j));
+                        let at = (first_m + i) * c_strides.0 + (first_n + j) * c_strides.1;
+                        write(simd, &tile, alpha, beta, &mut c[at..], c_strides, rows, columns);
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// Packs a block into panels of `width`: within a panel, `depth` steps of `width` elements; what is missing is 0.
+/// Element `(step, i)` of the block is `from[origin + step * step_stride + i * stride]`.
+#[inline(always)]
+fn pack(
+    from: &[f32],
+    (origin, step_stride, stride): (usize, usize, usize),
+    depth: usize,
+    len: usize,
+    width: usize,
+    to: &mut [f32],
+) {
+    if depth == 0 {
+        return;
+    }
+    for (panel, to) in to.chunks_exact_mut(width * depth).take(len.div_ceil(width)).enumerate() {
+        let first = panel * width;
+        let count = width.min(len - first);
+        let from = &from[origin + first * stride..];
+        if stride == 1 {
+            for (step, to) in to.chunks_exact_mut(width).enumerate() {
+                to[..count].copy_from_slice(&from[step * step_stride..][..count]);
+                to[count..].fill(0.0);
+            }
+        } else {
+            // Step by step, so that writes are contiguous and the `count` reads walk along as many cache lines.
+            for (step, to) in to.chunks_exact_mut(width).enumerate() {
+                let from = from[step * step_stride..].iter().step_by(stride.max(1));
+                for (to, &value) in to[..count].iter_mut().zip(from) {
+                    *to = value;
+                }
+                to[count..].fill(0.0);
+            }
+        }
+    }
+}
+
+/// The product of a panel of `A` and one of `B`.
+#[inline(always)]
+fn tile<S: Simd, const MR: usize>(simd: S, a: &[f32], b: &[f32]) -> [[S::V; TILE_VECTORS]; MR] {
+    let mut sums = [[simd.splat(0.0); TILE_VECTORS]; MR];
+    for (a, b) in a.as_chunks::<MR>().0.iter().zip(b.chunks_exact(S::LANES * TILE_VECTORS)) {
+        let mut columns = [simd.splat(0.0); TILE_VECTORS];
+        for v in 0..TILE_VECTORS {
+            // SAFETY: a step of the panel holds `TILE_VECTORS` vectors.
+            columns[v] = unsafe { simd.load(b.as_ptr().add(v * S::LANES)) };
+        }
+        for r in 0..MR {
+            let row = simd.splat(a[r]);
+            for v in 0..TILE_VECTORS {
+                sums[r][v] = simd.mul_add(columns[v], row, sums[r][v]);
+            }
+        }
+    }
+    sums
+}
+
+/// `C = alpha tile + beta C` for the first `rows` and `columns` of a tile that begins at `c[0]`.
+#[inline(always)]
+fn write<S: Simd, const MR: usize>(
+    simd: S,
+    tile: &[[S::V; TILE_VECTORS]; MR],
+    alpha: f32,
+    beta: f32,
+    c: &mut [f32],
+    (row_stride, column_stride): (usize, usize),
+    rows: usize,
+    columns: usize,
+) {
+    let (alpha_v, beta_v, zero) = (simd.splat(alpha), simd.splat(beta), simd.splat(0.0));
+    for r in 0..MR {
+        if r >= rows {
+            break;
+        }
+        for v in 0..TILE_VECTORS {
+            let first = v * S::LANES;
+            if first >= columns {
+                break;
+            }
+            let count = S::LANES.min(columns - first);
+            let scaled = simd.mul_add(tile[r][v], alpha_v, zero);
+            if column_stride == 1 {
+                let c = &mut c[r * row_stride + first..][..count];
+                // SAFETY: `c` has `count` elements.
+                unsafe {
+                    if beta == 0.0 {
+                        simd.store_first(c.as_mut_ptr(), scaled, count);
+                    } else {
+                        let old = simd.load_first(c.as_ptr(), count);
+                        simd.store_first(c.as_mut_ptr(), simd.mul_add(old, beta_v, scaled), count);
+                    }
+                }
+            } else {
+                let mut lanes = [0.0; 16];
+                // SAFETY: no vector is longer than 16.
+                unsafe { simd.store(lanes.as_mut_ptr(), scaled) };
+                for (lane, &value) in lanes[..count].iter().enumerate() {
+                    let c = &mut c[r * row_stride + (first + lane) * column_stride];
+                    *c = if beta == 0.0 { value } else { beta * *c + value };
+                }
+            }
+        }
+    }
 }

@@ -74,6 +74,15 @@ impl Isa {
         }
     }
 
+    /// Values of `f32` in a vector.
+    pub(crate) fn lanes(self) -> usize {
+        match self.0 {
+            Level::Portable | Level::Neon => 4,
+            Level::Avx2 => 8,
+            Level::Avx512 => 16,
+        }
+    }
+
     pub(crate) fn level(self) -> Level {
         self.0
     }

@@ -1,7 +1,7 @@
 //! The arithmetic peak of one core, the measure of every other kernel.
 
 use crate::Isa;
-use crate::simd::Simd;
+
 use std::hint::black_box;
 use std::time::{Duration, Instant};
 

@@ -10,6 +10,16 @@ pub(crate) mod portable;
 #[cfg(target_arch = "x86_64")]
 pub(crate) mod x86;
 
+/// Elements in a cache line: a vector that crosses from one line into the next costs two loads.
+pub(crate) const ALIGNMENT: usize = 16;
+
+/// The part of `scratch` that begins on a cache line; up to `ALIGNMENT` elements are lost.
+#[inline(always)]
+pub(crate) fn align(scratch: &mut [f32]) -> &mut [f32] {
+    let skip = scratch.as_ptr().align_offset(ALIGNMENT * size_of::<f32>());
+    &mut scratch[skip.min(ALIGNMENT)..]
+}
+
 /// Vectors of `LANES` values of `f32`.
 pub(crate) trait Simd: Copy {
     /// A vector.

@@ -1,0 +1,230 @@
+//! The direct kernel: a sum over taps, with vectors along the positions of the output.
+//!
+//! A tile is 8 output channels by 3 vectors: 24 accumulators. For each tap it loads 3 vectors of the input, shifted by
+//! the offset of the tap, and multiplies them by 8 weights: 11 loads for 24 multiply-adds, so arithmetic is the limit.
+//! With 16 registers a tile has 4 channels. Each output is one chain of multiply-adds in the order of the taps, whatever
+//! the tile it falls in, so it does not depend on the number of images.
+
+use super::grid::Span;
+use crate::simd::Simd;
+
+/// Vectors in a tile.
+pub(crate) const TILE_VECTORS: usize = 3;
+
+/// Taps that all channels go through before the next: the input they touch, 1.3 to 1.6 cache lines each, then stays in
+/// the first-level cache. Between blocks the sums wait in the output.
+const BLOCK_TAPS: usize = 240;
+
+/// Output channels of a tile for `channels` in all: the height that leaves the fewest rows empty.
+pub(crate) fn tile_height(many_registers: bool, channels: usize) -> usize {
+    let heights: &[usize] = if many_registers { &[8, 6, 4] } else { &[4, 3] };
+    *heights.iter().min_by_key(|&&height| channels.div_ceil(height) * height).unwrap_or(&4)
+}
+
+/// `out[o][p] = bias[o] + sum over k of weight[o][k] * x[start(p) + taps[k]]`, for each image.
+#[derive(Clone, Debug)]
+pub(crate) struct TapSum {
+    /// Offset of each tap.
+    pub taps: Vec<usize>,
+    /// Where the weight of each tap is for channel 0, and how far apart channels are.
+    pub weights: Vec<usize>,
+    pub weight_stride: usize,
+    /// The positions of one image.
+    pub spans: Vec<Span>,
+    /// Where the first window begins in an input image.
+    pub origin: usize,
+    /// Elements of an input image.
+    pub in_image: usize,
+    /// Output channels.
+    pub channels: usize,
+    /// Elements of an output plane; an output image is `channels` planes.
+    pub plane: usize,
+}
+
+impl TapSum {
+    /// Elements that the packed weights and bias take for tiles of any height.
+    pub fn packed_len(&self) -> usize {
+        (self.channels + 8) * (self.taps.len() + 1)
+    }
+
+    /// Packs bias (none: 0) and weights into panels of `height` channels: first the bias, then tap by tap.
+    #[inline(always)]
+    pub fn pack(&self, height: usize, bias: Option<&[f32]>, weight: &[f32], packed: &mut [f32]) {
+        let panels = packed.chunks_exact_mut(height * (self.taps.len() + 1));
+        for (first, to) in (0..self.channels).step_by(height).zip(panels) {
+            let rows = height.min(self.channels - first);
+            let (to_bias, to) = to.split_at_mut(height);
+            to_bias.fill(0.0);
+            if let Some(bias) = bias {
+                to_bias[..rows].copy_from_slice(&bias[first..first + rows]);
+            }
+            for (to, &from) in to.chunks_exact_mut(height).zip(&self.weights) {
+                let from = weight[from + first * self.weight_stride..].iter().step_by(self.weight_stride);
+                to[rows..].fill(0.0);
+                for (to, &weight) in to[..rows].iter_mut().zip(from) {
+                    *to = weight;
+                }
+            }
+        }
+    }
+
+    /// Computes the images in `x` with weights packed for `tile_height`; `y` is overwritten.
+    #[inline(always)]
+    pub fn run<S: Simd>(&self, simd: S, x: &[f32], packed: &[f32], y: &mut [f32]) {
+        match tile_height(S::MANY_REGISTERS, self.channels) {
+            8 if S::MANY_REGISTERS => self.run_height::<S, 8>(simd, x, packed, y),
+            6 if S::MANY_REGISTERS => self.run_height::<S, 6>(simd, x, packed, y),
+            3 if !S::MANY_REGISTERS => self.run_height::<S, 3>(simd, x, packed, y),
+            _ => self.run_height::<S, 4>(simd, x, packed, y),
+        }
+    }
+
+    /// The largest offset of a tap.
+    #[inline(always)]
+    pub fn farthest(&self) -> usize {
+        self.taps.iter().max().copied().unwrap_or(0)
+    }
+
+    /// What the tiles rely on: for each image, every lane that holds an output finds its input and its output.
+    #[inline(always)]
+    pub fn check<S: Simd>(&self, images: usize, x_len: usize, y_len: usize) {
+        assert_eq!(y_len, images * self.channels * self.plane, "tap sum: not a whole number of output images");
+        assert!(x_len >= images * self.in_image, "tap sum: too few input images");
+        let farthest = self.farthest();
+        for span in &self.spans {
+            assert!(self.origin + span.start + span.reach() + farthest <= self.in_image, "tap sum: input too short");
+            assert!(span.out + span.lanes.count_ones() as usize <= self.plane, "tap sum: output too short");
+            assert!(span.lanes != 0 && span.reach() <= S::LANES, "tap sum: a span is wider than a vector");
+        }
+    }
+
+    #[inline(always)]
+    fn run_height<S: Simd, const MR: usize>(&self, simd: S, x: &[f32], packed: &[f32], y: &mut [f32]) {
+        let images = y.len() / (self.channels * self.plane);
+        self.check::<S>(images, x.len(), y.len());
+        let panel_len = MR * (self.taps.len() + 1);
+        assert!(packed.len() >= self.channels.div_ceil(MR) * panel_len, "tap sum: packed weights are too short");
+        let farthest = self.farthest();
+        let total = images * self.spans.len();
+        let mut next = 0;
+        while next < total {
+            let count = (total - next).min(TILE_VECTORS);
+            // SAFETY: `check` holds for every image, and tiles are asked for only existing vectors.
+            unsafe {
+                match count {
+                    3 => self.column::<S, MR, 3>(simd, next, farthest, x, packed, y),
+                    2 => self.column::<S, MR, 2>(simd, next, farthest, x, packed, y),
+                    _ => self.column::<S, MR, 1>(simd, next, farthest, x, packed, y),
+                }
+            }
+            next += count;
+        }
+    }
+
+    /// All channels of `NV` vectors, the first of which is vector number `next` of the batch.
+    ///
+    /// # Safety
+    /// Vectors `next..next + NV` exist, and `check` has passed.
+    #[inline(always)]
+    unsafe fn column<S: Simd, const MR: usize, const NV: usize>(
+        &self,
+        simd: S,
+        next: usize,
+        farthest: usize,
+        x: &[f32],
+        packed: &[f32],
+        y: &mut [f32],
+    ) {
+        let mut starts = [x.as_ptr(); NV];
+        let mut reaches = [0; NV];
+        let mut outs = [0; NV];
+        let mut lanes = [0; NV];
+        let mut whole = true;
+        for v in 0..NV {
+            let image = (next + v) / self.spans.len();
+            let span = self.spans[(next + v) % self.spans.len()];
+            let start = image * self.in_image + self.origin + span.start;
+            whole &= start + farthest + S::LANES <= x.len();
+            starts[v] = x[start..].as_ptr();
+            reaches[v] = span.reach();
+            outs[v] = image * self.channels * self.plane + span.out;
+            lanes[v] = span.lanes;
+        }
+        let full = (1u32 << S::LANES) - 1;
+        let blocks = self.taps.len().div_ceil(BLOCK_TAPS).max(1);
+        let block = self.taps.len().div_ceil(blocks).max(1);
+        for (number, taps) in self.taps.chunks(block).enumerate() {
+            let panels = packed.chunks_exact(MR * (self.taps.len() + 1));
+            for (first, panel) in (0..self.channels).step_by(MR).zip(panels) {
+                let rows = MR.min(self.channels - first);
+                let (panel, _) = panel.as_chunks::<MR>();
+                let mut sums = [[simd.splat(0.0); NV]; MR];
+                // SAFETY: every tap of every lane that holds an output lies in `x`, and its output in `y`, by `check`;
+                // loads go no further unless `whole` says that all lanes may be read.
+                unsafe {
+                    for r in 0..MR {
+                        for v in 0..NV {
+                            sums[r][v] = if number == 0 {
+                                simd.splat(panel[0][r])
+                            } else if r < rows {
+                                simd.load_spread(y.as_ptr().add(outs[v] + (first + r) * self.plane), lanes[v])
+                            } else {
+                                simd.splat(0.0)
+                            };
+                        }
+                    }
+                    let weights = &panel[1 + number * block..][..taps.len()];
+                    if whole {
+                        tile::<S, MR, NV, false>(simd, taps, starts, reaches, weights, &mut sums);
+                    } else {
+                        tile::<S, MR, NV, true>(simd, taps, starts, reaches, weights, &mut sums);
+                    }
+                    for r in 0..rows {
+                        for v in 0..NV {
+                            let to = y.as_mut_ptr().add(outs[v] + (first + r) * self.plane);
+                            if lanes[v] == full {
+                                simd.store(to, sums[r][v]);
+                            } else {
+                                simd.store_gathered(to, sums[r][v], lanes[v]);
+                            }
+                        }
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// Adds the products of `MR` channels and `NV` vectors over the taps to `sums`.
+///
+/// # Safety
+/// For every start and tap, `reach` elements from `start + tap` on are readable, and `LANES` unless `MASKED`.
+#[inline(always)]
+unsafe fn tile<S: Simd, const MR: usize, const NV: usize, const MASKED: bool>(
+    simd: S,
+    taps: &[usize],
+    starts: [*const f32; NV],
+    reaches: [usize; NV],
+    weights: &[[f32; MR]],
+    sums: &mut [[S::V; NV]; MR],
+) {
+    // Loops over arrays, not `from_fn`: a closure might not be inlined into the function with the instruction set.
+    let mut acc = *sums;
+    for (&tap, weights) in taps.iter().zip(weights) {
+        let mut x = [simd.splat(0.0); NV];
+        for v in 0..NV {
+            // SAFETY: as the caller promises.
+            unsafe {
+                let from = starts[v].add(tap);
+                x[v] = if MASKED { simd.load_first(from, reaches[v]) } else { simd.load(from) };
+            }
+        }
+        for r in 0..MR {
+            let weight = simd.splat(weights[r]);
+            for v in 0..NV {
+                acc[r][v] = simd.mul_add(x[v], weight, acc[r][v]);
+            }
+        }
+    }
+    *sums = acc;
+}

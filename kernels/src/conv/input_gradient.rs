@@ -1,0 +1,200 @@
+//! The input gradient, as a convolution of the output gradient.
+//!
+//! With `iy + pad_top = q stride + r`, the taps that touch input row `iy` are `ky = r + j stride`, and they meet the
+//! output rows `q - j`: for each remainder `r` the gradient is a sum of stride 1 over the zero-padded output gradient.
+//! The same holds for columns. With stride 1 there is one remainder, and the sum is written to `dx` directly; else the
+//! phases are computed side by side in scratch and woven into `dx`.
+
+use super::direct::{TapSum, tile_height};
+use super::{ConvShape, FORWARD_COPIES, MOST_LANES, grid, group_of};
+use crate::Isa;
+
+/// The rows, or columns, of the input that leave one remainder.
+#[derive(Clone, Copy, Debug)]
+struct Phase {
+    /// The remainder.
+    remainder: usize,
+    /// Number of taps that touch them.
+    taps: usize,
+    /// The first quotient `q`, and how many there are.
+    first: usize,
+    count: usize,
+}
+
+/// The phases of one direction that have any rows and taps.
+fn phases(len: usize, kernel: usize, stride: usize, pad: usize) -> Vec<Phase> {
+    let phase = |remainder: usize| {
+        let first = pad.saturating_sub(remainder).div_ceil(stride);
+        let end = (len + pad).saturating_sub(remainder).div_ceil(stride);
+        Phase { remainder, taps: (kernel - remainder).div_ceil(stride), first, count: end.saturating_sub(first) }
+    };
+    (0..stride.min(kernel)).map(phase).filter(|phase| phase.count > 0).collect()
+}
+
+/// Where one remainder of rows and one of columns meet.
+#[derive(Clone, Debug)]
+struct Part {
+    rows: Phase,
+    columns: Phase,
+    sum: TapSum,
+}
+
+/// The tables of the input gradient of one shape.
+#[derive(Clone, Debug)]
+pub(crate) struct InputGradient {
+    shape: ConvShape,
+    parts: Vec<Part>,
+    /// Rows and columns of zeros before the output gradient, and the sizes of a padded plane.
+    before: (usize, usize),
+    padded: (usize, usize),
+}
+
+impl InputGradient {
+    pub fn new(shape: ConvShape, isa: Isa) -> InputGradient {
+        let ConvShape { c, h, w, oc, kh, kw, stride_h, stride_w, .. } = shape;
+        let (all_rows, all_columns) = (phases(h, kh, stride_h, shape.pad_top), phases(w, kw, stride_w, shape.pad_left));
+        let before = ((kh - 1) / stride_h, (kw - 1) / stride_w);
+        let end = |phases: &[Phase]| phases.iter().map(|p| p.first + p.count).max().unwrap_or(0);
+        let padded = (before.0 + end(&all_rows).max(shape.out_h()), before.1 + end(&all_columns).max(shape.out_w()));
+        let mut parts = Vec::new();
+        for &rows in &all_rows {
+            for &columns in &all_columns {
+                let (mut taps, mut weights) = (Vec::new(), Vec::new());
+                for o in 0..oc {
+                    for j in 0..rows.taps {
+                        for i in 0..columns.taps {
+                            let (up, left) = (rows.taps - 1 - j, columns.taps - 1 - i);
+                            taps.push((o * padded.0 + up) * padded.1 + left);
+                            let (ky, kx) = (rows.remainder + j * stride_h, columns.remainder + i * stride_w);
+                            weights.push((o * c * kh + ky) * kw + kx);
+                        }
+                    }
+                }
+                let (top, left) = (before.0 + 1 - rows.taps, before.1 + 1 - columns.taps);
+                let sum = TapSum {
+                    taps,
+                    weights,
+                    weight_stride: kh * kw,
+                    spans: grid::spans(rows.count, columns.count, padded.1, isa.lanes()),
+                    origin: (rows.first + top) * padded.1 + columns.first + left,
+                    in_image: oc * padded.0 * padded.1,
+                    channels: c,
+                    plane: rows.count * columns.count,
+                };
+                parts.push(Part { rows, columns, sum });
+            }
+        }
+        InputGradient { shape, parts, before, padded }
+    }
+
+    /// Elements of one padded output gradient.
+    fn image(&self) -> usize {
+        self.shape.oc * self.padded.0 * self.padded.1
+    }
+
+    /// Elements of the weights of all parts, and of the largest phase of one image.
+    fn part_lens(&self) -> (usize, usize) {
+        let packed = self.parts.iter().map(|part| part.sum.packed_len()).sum();
+        let phase = self.parts.iter().map(|part| part.sum.channels * part.sum.plane).max().unwrap_or(0);
+        (packed, if self.direct() { 0 } else { phase })
+    }
+
+    /// Whether the single part is the whole input gradient.
+    fn direct(&self) -> bool {
+        self.shape.stride_h == 1 && self.shape.stride_w == 1
+    }
+
+    pub fn scratch_len(&self) -> usize {
+        let group = group_of(self.image(), FORWARD_COPIES);
+        let (packed, phase) = self.part_lens();
+        group * (self.image() + phase) + MOST_LANES + packed
+    }
+
+    /// Copies output gradients `[oc][out_h][out_w]` into zero-padded planes.
+    #[inline(always)]
+    fn pad(&self, dy: &[f32], to: &mut [f32]) {
+        let (out_h, out_w) = (self.shape.out_h(), self.shape.out_w());
+        let planes = dy.chunks_exact(out_h * out_w);
+        for (dy, to) in planes.zip(to.chunks_exact_mut(self.padded.0 * self.padded.1)) {
+            to.fill(0.0);
+            for (dy, to) in dy.chunks_exact(out_w).zip(to.chunks_exact_mut(self.padded.1).skip(self.before.0)) {
+                to[self.before.1..][..out_w].copy_from_slice(dy);
+            }
+        }
+    }
+
+    /// Writes the rows and columns of one part into the images `dx`.
+    #[inline(always)]
+    fn weave(&self, part: &Part, phase: &[f32], dx: &mut [f32]) {
+        let ConvShape { h, w, stride_h, stride_w, pad_top, pad_left, .. } = self.shape;
+        let (rows, columns) = (part.rows, part.columns);
+        let left = columns.first * stride_w + columns.remainder - pad_left;
+        for (phase, dx) in phase.chunks_exact(part.sum.plane).zip(dx.chunks_exact_mut(h * w)) {
+            for (q, from) in phase.chunks_exact(columns.count).enumerate() {
+                let iy = (rows.first + q) * stride_h + rows.remainder - pad_top;
+                put_every(from, stride_w, &mut dx[iy * w + left..(iy + 1) * w]);
+            }
+        }
+    }
+}
+
+/// `to[i * stride] = from[i]`; constant strides vectorise.
+#[inline(always)]
+fn put_every(from: &[f32], stride: usize, to: &mut [f32]) {
+    let to = &mut to[..(from.len() - 1) * stride + 1];
+    match stride {
+        2 => from.iter().enumerate().for_each(|(i, &from)| to[i * 2] = from),
+        _ => from.iter().enumerate().for_each(|(i, &from)| to[i * stride] = from),
+    }
+}
+
+per_isa! {
+    /// The input gradient of the images in `dy`; `dx` is overwritten.
+    pub(crate) fn run<S>(
+        simd: S,
+        gradient: &InputGradient,
+        dy: &[f32],
+        weight: &[f32],
+        dx: &mut [f32],
+        scratch: &mut [f32],
+    ) {
+        let c = gradient.shape.c;
+        let group = group_of(gradient.image(), FORWARD_COPIES);
+        let (packed_len, phase_len) = gradient.part_lens();
+        let (packed, scratch) = scratch.split_at_mut(packed_len);
+        let (phase, copy) = scratch.split_at_mut(group * phase_len);
+        let height = tile_height(S::MANY_REGISTERS, c);
+
+        let mut rest = &mut *packed;
+        for part in &gradient.parts {
+            let (to, after) = rest.split_at_mut(part.sum.packed_len());
+            rest = after;
+            part.sum.pack(height, None, weight, to);
+        }
+
+        // Input that no window touches keeps this zero; with stride 1 the single part writes everything.
+        if !gradient.direct() || gradient.parts.is_empty() {
+            dx.fill(0.0);
+        }
+        let groups = dy.chunks(group * gradient.shape.y_len()).zip(dx.chunks_mut(group * gradient.shape.x_len()));
+        for (dy, dx) in groups {
+            let images = dy.len() / gradient.shape.y_len();
+            let used = images * gradient.image();
+            gradient.pad(dy, &mut copy[..used]);
+            copy[used..used + MOST_LANES].fill(0.0);
+            let padded = &copy[..used + MOST_LANES];
+            let mut rest = &*packed;
+            for part in &gradient.parts {
+                let (packed, after) = rest.split_at(part.sum.packed_len());
+                rest = after;
+                if gradient.direct() {
+                    part.sum.run(simd, padded, packed, dx);
+                } else {
+                    let phase = &mut phase[..images * c * part.sum.plane];
+                    part.sum.run(simd, padded, packed, phase);
+                    gradient.weave(part, phase, dx);
+                }
+            }
+        }
+    }
+}

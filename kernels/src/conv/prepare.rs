@@ -1,0 +1,107 @@
+//! Images as the direct kernels read them: padded, and with strided columns brought side by side.
+
+use super::ConvShape;
+
+/// How the planes of an input image are laid out for a stride-1 sum over taps.
+///
+/// With stride `s`, the input row `oy s + ky` is row `oy + ky / s` among the rows that leave the remainder `ky % s`; the
+/// same holds for columns. Splitting the padded image into its `s x s` phases therefore turns any convolution into one
+/// of stride 1, with a table of tap offsets. A convolution of stride 1 without padding reads the image as it is.
+#[derive(Clone, Debug)]
+pub(crate) struct Layout {
+    shape: ConvShape,
+    /// Phases in each direction; remainders that no tap has are left out.
+    phases: (usize, usize),
+    /// Rows of a phase plane.
+    rows: usize,
+    /// Elements between two rows of a phase plane.
+    pub pitch: usize,
+    /// Whether images must be copied into this layout.
+    pub copies: bool,
+}
+
+impl Layout {
+    pub fn new(shape: ConvShape) -> Layout {
+        let ConvShape { h, w, kh, kw, stride_h, stride_w, .. } = shape;
+        let padded = shape.pad_top + shape.pad_bottom + shape.pad_left + shape.pad_right > 0;
+        if stride_h == 1 && stride_w == 1 && !padded {
+            return Layout { shape, phases: (1, 1), rows: h, pitch: w, copies: false };
+        }
+        Layout {
+            shape,
+            phases: (kh.min(stride_h), kw.min(stride_w)),
+            rows: shape.out_h() + (kh - 1) / stride_h,
+            pitch: shape.out_w() + (kw - 1) / stride_w,
+            copies: true,
+        }
+    }
+
+    /// Elements of one image.
+    pub fn image(&self) -> usize {
+        self.shape.c * self.phases.0 * self.phases.1 * self.rows * self.pitch
+    }
+
+    /// The offset of each tap, in the order of the weights: channel, ky, kx.
+    pub fn taps(&self) -> Vec<usize> {
+        let ConvShape { c, kh, kw, stride_h, stride_w, .. } = self.shape;
+        let mut taps = Vec::with_capacity(c * kh * kw);
+        for channel in 0..c {
+            for ky in 0..kh {
+                for kx in 0..kw {
+                    let phase = (channel * self.phases.0 + ky % stride_h) * self.phases.1 + kx % stride_w;
+                    taps.push((phase * self.rows + ky / stride_h) * self.pitch + kx / stride_w);
+                }
+            }
+        }
+        taps
+    }
+
+    /// Copies images `[c][h][w]` into this layout; `to` is overwritten.
+    #[inline(always)]
+    pub fn copy(&self, x: &[f32], to: &mut [f32]) {
+        let ConvShape { c, h, w, stride_h, stride_w, pad_top, pad_left, .. } = self.shape;
+        let plane = self.rows * self.pitch;
+        if h * w == 0 || plane == 0 {
+            to.fill(0.0);
+            return;
+        }
+        debug_assert_eq!(x.len() / (c * h * w), to.len() / self.image());
+        let phases = self.phases.0 * self.phases.1;
+        for (x, planes) in x.chunks_exact(h * w).zip(to.chunks_exact_mut(phases * plane)) {
+            for (phase, to) in planes.chunks_exact_mut(plane).enumerate() {
+                let (phase_y, phase_x) = (phase / self.phases.1, phase % self.phases.1);
+                // The columns `q` of the phase with `0 <= q stride + phase - pad < w`.
+                let first = pad_left.saturating_sub(phase_x).div_ceil(stride_w).min(self.pitch);
+                let last = (w + pad_left).saturating_sub(phase_x).div_ceil(stride_w).clamp(first, self.pitch);
+                for (q, to) in to.chunks_exact_mut(self.pitch).enumerate() {
+                    let row = q * stride_h + phase_y;
+                    if row < pad_top || row - pad_top >= h || first == last {
+                        to.fill(0.0);
+                        continue;
+                    }
+                    let x = &x[(row - pad_top) * w..][..w];
+                    to[..first].fill(0.0);
+                    to[last..].fill(0.0);
+                    take_every(&x[first * stride_w + phase_x - pad_left..], stride_w, &mut to[first..last]);
+                }
+            }
+        }
+    }
+}
+
+/// `to[i] = x[i * stride]`; constant strides vectorise.
+#[inline(always)]
+fn take_every(x: &[f32], stride: usize, to: &mut [f32]) {
+    #[inline(always)]
+    fn run(x: &[f32], stride: usize, to: &mut [f32]) {
+        let x = &x[..(to.len() - 1) * stride + 1];
+        for (i, to) in to.iter_mut().enumerate() {
+            *to = x[i * stride];
+        }
+    }
+    match stride {
+        1 => to.copy_from_slice(&x[..to.len()]),
+        2 => run(x, 2, to),
+        _ => run(x, stride, to),
+    }
+}

@@ -1,0 +1,174 @@
+//! The weight gradient, with vectors along the positions of the output.
+//!
+//! `dweight[o][k] = sum over p of dy[o][p] * x[start(p) + taps[k]]`. A tile is 8 output channels by 3 taps: for each
+//! vector of positions it loads 8 vectors of `dy` and 3 of `x` for 24 multiply-adds. Sums stay spread over the lanes
+//! until the end. So that `dy` comes from the first-level cache, a chunk of `CHUNK` vectors is packed once and all taps
+//! run over it; the sums of a panel of channels wait in scratch meanwhile.
+
+use super::direct::{TapSum, tile_height};
+use crate::simd::{ALIGNMENT, Simd, align};
+
+/// Taps in a tile.
+const TILE_TAPS: usize = 3;
+/// Vectors of positions that are packed at a time: 32 x 8 channels x 64 bytes is half of a 32 KiB cache.
+const CHUNK: usize = 32;
+/// The most lanes and channels a tile has on any instruction set.
+const MOST_LANES: usize = 16;
+const MOST_CHANNELS: usize = 8;
+
+/// Elements of scratch for `taps` taps.
+pub(crate) fn scratch_len(taps: usize) -> usize {
+    (CHUNK * MOST_CHANNELS + taps.next_multiple_of(TILE_TAPS) * MOST_CHANNELS) * MOST_LANES + ALIGNMENT
+}
+
+/// Adds the gradient of the images in `dy` to `dweight` and `dbias`.
+///
+/// `sum` is the forward pass: its taps, positions and sizes, `x` its input.
+#[inline(always)]
+pub(crate) fn run<S: Simd>(
+    simd: S,
+    sum: &TapSum,
+    x: &[f32],
+    dy: &[f32],
+    dweight: &mut [f32],
+    dbias: &mut [f32],
+    scratch: &mut [f32],
+) {
+    match tile_height(S::MANY_REGISTERS, sum.channels) {
+        8 if S::MANY_REGISTERS => run_height::<S, 8>(simd, sum, x, dy, dweight, dbias, scratch),
+        6 if S::MANY_REGISTERS => run_height::<S, 6>(simd, sum, x, dy, dweight, dbias, scratch),
+        3 if !S::MANY_REGISTERS => run_height::<S, 3>(simd, sum, x, dy, dweight, dbias, scratch),
+        _ => run_height::<S, 4>(simd, sum, x, dy, dweight, dbias, scratch),
+    }
+}
+
+#[inline(always)]
+fn run_height<S: Simd, const MR: usize>(
+    simd: S,
+    sum: &TapSum,
+    x: &[f32],
+    dy: &[f32],
+    dweight: &mut [f32],
+    dbias: &mut [f32],
+    scratch: &mut [f32],
+) {
+    let taps = sum.taps.len();
+    let image_len = sum.channels * sum.plane;
+    let images = dy.len() / image_len;
+    sum.check::<S>(images, x.len(), dy.len());
+    assert!(dweight.len() == sum.channels * taps && dbias.len() == sum.channels, "weight gradient: wrong length");
+    let (packed, sums) = align(scratch).split_at_mut(CHUNK * MR * S::LANES);
+    let sums = &mut sums[..taps.next_multiple_of(TILE_TAPS) * MR * S::LANES];
+    let total = images * sum.spans.len();
+    let farthest = sum.farthest();
+
+    for first in (0..sum.channels).step_by(MR) {
+        let rows = MR.min(sum.channels - first);
+        packed.fill(0.0);
+        sums.fill(0.0);
+        let mut bias = [simd.splat(0.0); MR];
+        for chunk in (0..total).step_by(CHUNK) {
+            let count = CHUNK.min(total - chunk);
+            let mut starts = [0; CHUNK];
+            let mut whole = 0;
+            for i in 0..count {
+                let image = (chunk + i) / sum.spans.len();
+                let span = sum.spans[(chunk + i) % sum.spans.len()];
+                starts[i] = image * sum.in_image + sum.origin + span.start;
+                // Vectors come in ascending order: only the last ones of the last image may end outside `x`.
+                whole += usize::from(starts[i] + farthest + S::LANES <= x.len());
+                for r in 0..rows {
+                    // SAFETY: the plane of an output channel holds the outputs of every span (`check`); `packed` holds
+                    // `CHUNK * MR` vectors.
+                    unsafe {
+                        let from = dy.as_ptr().add(image * image_len + (first + r) * sum.plane + span.out);
+                        let full = span.lanes == (1 << S::LANES) - 1;
+                        let values = if full { simd.load(from) } else { simd.load_spread(from, span.lanes) };
+                        simd.store(packed.as_mut_ptr().add((i * MR + r) * S::LANES), values);
+                        bias[r] = simd.mul_add(values, simd.splat(1.0), bias[r]);
+                    }
+                }
+            }
+            for (group, sums) in sums.chunks_exact_mut(TILE_TAPS * MR * S::LANES).enumerate() {
+                let mut offsets = [0; TILE_TAPS];
+                for (t, offset) in offsets.iter_mut().enumerate() {
+                    *offset = sum.taps.get(group * TILE_TAPS + t).copied().unwrap_or(0);
+                }
+                // SAFETY: the first `whole` vectors may be read in full for every tap, the rest up to their reach;
+                // `packed` holds `count * MR` vectors and `sums` the vectors of a tile.
+                unsafe { tile::<S, MR>(simd, sum, x, packed, &starts[..count], chunk, whole, offsets, sums) };
+            }
+        }
+        for r in 0..rows {
+            let o = first + r;
+            dbias[o] += simd.sum(bias[r]);
+            for k in 0..taps {
+                let at = (k / TILE_TAPS * TILE_TAPS * MR + r * TILE_TAPS + k % TILE_TAPS) * S::LANES;
+                // SAFETY: `sums` holds `MR * TILE_TAPS` vectors for each group of taps.
+                dweight[o * taps + k] += simd.sum(unsafe { simd.load(sums[at..].as_ptr()) });
+            }
+        }
+    }
+}
+
+/// Adds the products of `MR` channels and the taps at `offsets` over a chunk of positions to `sums`.
+///
+/// # Safety
+/// `packed` holds `starts.len() * MR` vectors and `sums` `MR * TILE_TAPS`. From each start plus each offset, `LANES`
+/// elements of `x` are readable for the first `whole` vectors, and as many as the span reaches for the others.
+#[inline(always)]
+unsafe fn tile<S: Simd, const MR: usize>(
+    simd: S,
+    sum: &TapSum,
+    x: &[f32],
+    packed: &[f32],
+    starts: &[usize],
+    chunk: usize,
+    whole: usize,
+    offsets: [usize; TILE_TAPS],
+    sums: &mut [f32],
+) {
+    let mut acc = [[simd.splat(0.0); TILE_TAPS]; MR];
+    let mut from = [x.as_ptr(); TILE_TAPS];
+    for t in 0..TILE_TAPS {
+        from[t] = from[t].wrapping_add(offsets[t]);
+    }
+    // SAFETY: as the caller promises.
+    unsafe {
+        for r in 0..MR {
+            for t in 0..TILE_TAPS {
+                acc[r][t] = simd.load(sums.as_ptr().add((r * TILE_TAPS + t) * S::LANES));
+            }
+        }
+        for (i, &start) in starts.iter().enumerate().take(whole) {
+            let mut x = [simd.splat(0.0); TILE_TAPS];
+            for t in 0..TILE_TAPS {
+                x[t] = simd.load(from[t].wrapping_add(start));
+            }
+            for r in 0..MR {
+                let dy = simd.load(packed.as_ptr().add((i * MR + r) * S::LANES));
+                for t in 0..TILE_TAPS {
+                    acc[r][t] = simd.mul_add(x[t], dy, acc[r][t]);
+                }
+            }
+        }
+        for (i, &start) in starts.iter().enumerate().skip(whole) {
+            let reach = sum.spans[(chunk + i) % sum.spans.len()].reach();
+            let mut x = [simd.splat(0.0); TILE_TAPS];
+            for t in 0..TILE_TAPS {
+                x[t] = simd.load_first(from[t].wrapping_add(start), reach);
+            }
+            for r in 0..MR {
+                let dy = simd.load(packed.as_ptr().add((i * MR + r) * S::LANES));
+                for t in 0..TILE_TAPS {
+                    acc[r][t] = simd.mul_add(x[t], dy, acc[r][t]);
+                }
+            }
+        }
+        for r in 0..MR {
+            for t in 0..TILE_TAPS {
+                simd.store(sums.as_mut_ptr().add((r * TILE_TAPS + t) * S::LANES), acc[r][t]);
+            }
+        }
+    }
+}

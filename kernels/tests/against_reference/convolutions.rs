@@ -1,0 +1,109 @@
+//! Convolution and its gradients.
+
+use super::{Failures, isas, nans, numbers};
+use steersman_kernels::conv::{Conv, ConvShape};
+use steersman_kernels::reference;
+
+/// Sizes c, h, w, oc; kernel; stride; padding top, bottom, left, right.
+type Case = ([usize; 4], [usize; 2], [usize; 2], [usize; 4]);
+
+const CASES: &[Case] = &[
+    // The layers of the networks, cut down in height or channels where that changes nothing.
+    ([3, 6, 160, 8], [3, 3], [1, 1], [0; 4]),
+    ([8, 5, 158, 16], [3, 3], [1, 1], [0; 4]),
+    ([16, 5, 78, 24], [3, 3], [1, 1], [0; 4]),
+    ([24, 8, 38, 32], [3, 3], [1, 1], [0; 4]),
+    ([32, 3, 18, 64], [3, 3], [1, 1], [0; 4]),
+    ([1, 64, 64, 6], [3, 3], [1, 1], [0; 4]),
+    ([6, 15, 15, 16], [3, 3], [1, 1], [0; 4]),
+    ([3, 13, 200, 24], [5, 5], [2, 2], [0; 4]),
+    ([24, 9, 98, 36], [5, 5], [2, 2], [0; 4]),
+    ([36, 14, 47, 48], [5, 5], [2, 2], [0; 4]),
+    ([48, 5, 22, 64], [3, 3], [1, 1], [0; 4]),
+    ([64, 3, 20, 64], [3, 3], [1, 1], [0; 4]),
+    // Tile borders: output widths 1, 15, 16, 17, 47, 48, 49 and channels 1, 3, 7, 9.
+    ([1, 1, 1, 1], [1, 1], [1, 1], [0; 4]),
+    ([2, 3, 17, 7], [3, 3], [1, 1], [0; 4]),
+    ([2, 3, 18, 9], [3, 3], [1, 1], [0; 4]),
+    ([2, 4, 19, 3], [3, 3], [1, 1], [0; 4]),
+    ([1, 2, 48, 5], [2, 2], [1, 1], [0; 4]),
+    ([1, 2, 49, 4], [2, 2], [1, 1], [0; 4]),
+    ([1, 2, 50, 8], [2, 2], [1, 1], [0; 4]),
+    // Padding, uneven padding, strides that differ, kernels smaller than the stride, input that no window touches.
+    ([3, 7, 9, 5], [3, 3], [1, 1], [1; 4]),
+    ([3, 7, 9, 5], [3, 3], [2, 2], [0, 1, 0, 1]),
+    ([2, 6, 11, 4], [5, 2], [2, 3], [2, 1, 0, 3]),
+    ([2, 9, 10, 3], [1, 1], [2, 2], [0; 4]),
+    ([2, 8, 10, 3], [2, 1], [3, 4], [1, 0, 2, 0]),
+    ([1, 4, 4, 2], [3, 3], [1, 1], [4, 4, 5, 3]),
+    ([1, 2, 2, 2], [1, 1], [2, 2], [3, 3, 3, 3]),
+    ([4, 5, 6, 6], [5, 6], [1, 1], [0; 4]),
+    // A kernel that does not fit: no output.
+    ([2, 2, 2, 3], [3, 3], [1, 1], [0; 4]),
+];
+
+fn shape(&([c, h, w, oc], [kh, kw], [stride_h, stride_w], pad): &Case) -> ConvShape {
+    let [pad_top, pad_bottom, pad_left, pad_right] = pad;
+    ConvShape { c, h, w, oc, kh, kw, stride_h, stride_w, pad_top, pad_bottom, pad_left, pad_right }
+}
+
+#[test]
+fn convolutions_agree_with_the_loops() {
+    let mut failures = Failures::default();
+    for case in CASES {
+        let shape = shape(case);
+        let x_len = shape.c * shape.h * shape.w;
+        let y_len = shape.oc * shape.out_h() * shape.out_w();
+        let weight = numbers(1, shape.oc * shape.c * shape.kh * shape.kw);
+        let bias = numbers(2, shape.oc);
+        for n in [0, 1, 2, 5, 9] {
+            let (x, dy) = (numbers(3, n * x_len), numbers(4, n * y_len));
+            let (mut y, mut dx) = (nans(n * y_len), nans(n * x_len));
+            let (mut dweight, mut dbias) = (weight.clone(), bias.clone());
+            reference::conv_forward(&shape, n, &x, &weight, &bias, &mut y);
+            reference::conv_backward_input(&shape, n, &dy, &weight, &mut dx);
+            reference::conv_backward_weight(&shape, n, &x, &dy, &mut dweight, &mut dbias);
+            for isa in isas() {
+                let conv = Conv::new(shape, isa);
+                let what = format!("{} n={n} {shape:?}", isa.name());
+                let mut actual = nans(n * y_len);
+                conv.forward(n, &x, &weight, &bias, &mut actual, &mut nans(conv.scratch_len()));
+                failures.compare(&format!("forward {what}"), &actual, &y, 1e-5);
+                let mut actual = nans(n * x_len);
+                conv.backward_input(n, &dy, &weight, &mut actual, &mut nans(conv.scratch_len()));
+                failures.compare(&format!("backward_input {what}"), &actual, &dx, 1e-5);
+                let (mut actual, mut actual_bias) = (weight.clone(), bias.clone());
+                let scratch = &mut nans(conv.scratch_len());
+                conv.backward_weight(n, &x, &dy, &mut actual, &mut actual_bias, scratch);
+                failures.compare(&format!("backward_weight {what}"), &actual, &dweight, 1e-5);
+                failures.compare(&format!("bias gradient {what}"), &actual_bias, &dbias, 1e-5);
+            }
+        }
+    }
+    failures.report();
+}
+
+#[test]
+fn the_result_of_an_image_does_not_depend_on_the_batch() {
+    for case in CASES {
+        let shape = shape(case);
+        let (x_len, y_len) = (shape.c * shape.h * shape.w, shape.oc * shape.out_h() * shape.out_w());
+        let weight = numbers(1, shape.oc * shape.c * shape.kh * shape.kw);
+        let bias = numbers(2, shape.oc);
+        for isa in isas() {
+            let conv = Conv::new(shape, isa);
+            let mut scratch = nans(conv.scratch_len());
+            let (n, x, dy) = (11, numbers(3, 11 * x_len), numbers(4, 11 * y_len));
+            let (mut y, mut dx) = (nans(n * y_len), nans(n * x_len));
+            conv.forward(n, &x, &weight, &bias, &mut y, &mut scratch);
+            conv.backward_input(n, &dy, &weight, &mut dx, &mut scratch);
+            for image in [0, 4, 10] {
+                let (mut y_alone, mut dx_alone) = (nans(y_len), nans(x_len));
+                conv.forward(1, &x[image * x_len..][..x_len], &weight, &bias, &mut y_alone, &mut scratch);
+                conv.backward_input(1, &dy[image * y_len..][..y_len], &weight, &mut dx_alone, &mut scratch);
+                assert!(y_alone == y[image * y_len..][..y_len], "{} forward {image} {shape:?}", isa.name());
+                assert!(dx_alone == dx[image * x_len..][..x_len], "{} gradient {image} {shape:?}", isa.name());
+            }
+        }
+    }
+}

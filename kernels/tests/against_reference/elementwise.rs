@@ -1,0 +1,203 @@
+//! Everything that is not a product: activations, pooling, normalisation, updates, pixels.
+
+use super::{Failures, isas, nans, numbers};
+use steersman_kernels::update::AdamStep;
+use steersman_kernels::{activation, norm, pixels, pool, reference, update};
+
+/// Lengths around the vector widths.
+const LENGTHS: &[usize] = &[0, 1, 3, 4, 5, 15, 16, 17, 31, 100, 1027];
+
+#[test]
+fn activations_agree_with_the_loops() {
+    let mut failures = Failures::default();
+    for isa in isas() {
+        for &len in LENGTHS {
+            let (x, dy): (Vec<f32>, _) = (numbers(1, len).iter().map(|x| x * 4.0).collect(), numbers(2, len));
+            let (mut expected, mut actual) = (nans(len), nans(len));
+            reference::relu_forward(&x, &mut expected);
+            activation::relu_forward(isa, &x, &mut actual);
+            failures.compare(&format!("relu_forward {} {len}", isa.name()), &actual, &expected, 0.0);
+            let y = expected.clone();
+            let (mut expected, mut actual) = (nans(len), nans(len));
+            reference::relu_backward(&y, &dy, &mut expected);
+            activation::relu_backward(isa, &y, &dy, &mut actual);
+            failures.compare(&format!("relu_backward {} {len}", isa.name()), &actual, &expected, 0.0);
+
+            let (mut expected, mut actual) = (nans(len), nans(len));
+            reference::elu_forward(0.7, &x, &mut expected);
+            activation::elu_forward(isa, 0.7, &x, &mut actual);
+            failures.compare(&format!("elu_forward {} {len}", isa.name()), &actual, &expected, 1e-6);
+            let y = expected.clone();
+            let (mut expected, mut actual) = (nans(len), nans(len));
+            reference::elu_backward(0.7, &y, &dy, &mut expected);
+            activation::elu_backward(isa, 0.7, &y, &dy, &mut actual);
+            failures.compare(&format!("elu_backward {} {len}", isa.name()), &actual, &expected, 1e-6);
+        }
+    }
+    failures.report();
+}
+
+#[test]
+fn prelu_agrees_with_the_loops() {
+    let mut failures = Failures::default();
+    for isa in isas() {
+        for (slopes, repeat) in [(1, 1), (17, 1), (1, 33), (3, 16), (4, 45), (2, 0), (0, 3)] {
+            for n in [0, 1, 3] {
+                let len = n * slopes * repeat;
+                let what = format!("{} {slopes} slopes for {repeat}, n={n}", isa.name());
+                let (x, dy, slope) = (numbers(1, len), numbers(2, len), numbers(3, slopes));
+                let (mut expected, mut actual) = (nans(len), nans(len));
+                reference::prelu_forward(&slope, repeat, &x, &mut expected);
+                activation::prelu_forward(isa, n, &slope, repeat, &x, &mut actual);
+                failures.compare(&format!("prelu_forward {what}"), &actual, &expected, 0.0);
+                let (mut expected, mut actual) = (nans(len), nans(len));
+                let (mut dslope_expected, mut dslope) = (numbers(4, slopes), numbers(4, slopes));
+                reference::prelu_backward(&slope, repeat, &x, &dy, &mut expected, &mut dslope_expected);
+                activation::prelu_backward(isa, n, &slope, repeat, &x, &dy, &mut actual, &mut dslope);
+                failures.compare(&format!("prelu_backward {what}"), &actual, &expected, 0.0);
+                failures.compare(&format!("prelu slopes {what}"), &dslope, &dslope_expected, 1e-5);
+            }
+        }
+    }
+    failures.report();
+}
+
+#[test]
+fn pooling_agrees_with_the_loops() {
+    let mut failures = Failures::default();
+    let sizes = [
+        ([2, 6, 7], [2, 2], [2, 2]),
+        ([1, 61, 61], [4, 4], [4, 4]),
+        ([3, 38, 158], [2, 2], [2, 2]),
+        ([2, 5, 37], [3, 3], [1, 2]),
+        ([2, 9, 35], [3, 2], [2, 1]),
+        ([1, 8, 8], [2, 2], [3, 5]),
+        ([1, 1, 1], [1, 1], [1, 1]),
+        ([2, 3, 3], [4, 2], [1, 1]),
+    ];
+    for ([c, h, w], [kh, kw], [stride_h, stride_w]) in sizes {
+        let shape = pool::PoolShape { c, h, w, kh, kw, stride_h, stride_w };
+        let (x_len, y_len) = (c * h * w, c * shape.out_h() * shape.out_w());
+        for n in [0, 1, 3] {
+            // Few distinct values, so that windows hold their maximum more than once.
+            let x: Vec<f32> = numbers(1, n * x_len).iter().map(|x| (x * 4.0).round()).collect();
+            let dy = numbers(2, n * y_len);
+            for isa in isas() {
+                let what = format!("{} n={n} {shape:?}", isa.name());
+                let (mut expected, mut actual) = (nans(n * y_len), nans(n * y_len));
+                reference::max_forward(&shape, n, &x, &mut expected);
+                pool::max_forward(isa, &shape, n, &x, &mut actual);
+                failures.compare(&format!("max_forward {what}"), &actual, &expected, 0.0);
+                let y = expected.clone();
+                let (mut expected, mut actual) = (nans(n * x_len), nans(n * x_len));
+                reference::max_backward(&shape, n, &x, &y, &dy, &mut expected);
+                pool::max_backward(isa, &shape, n, &x, &y, &dy, &mut actual);
+                failures.compare(&format!("max_backward {what}"), &actual, &expected, 1e-6);
+                let (mut expected, mut actual) = (nans(n * y_len), nans(n * y_len));
+                reference::average_forward(&shape, n, &x, &mut expected);
+                pool::average_forward(isa, &shape, n, &x, &mut actual);
+                failures.compare(&format!("average_forward {what}"), &actual, &expected, 1e-6);
+                let (mut expected, mut actual) = (nans(n * x_len), nans(n * x_len));
+                reference::average_backward(&shape, n, &dy, &mut expected);
+                pool::average_backward(isa, &shape, n, &dy, &mut actual);
+                failures.compare(&format!("average_backward {what}"), &actual, &expected, 1e-6);
+            }
+        }
+    }
+    failures.report();
+}
+
+#[test]
+fn normalisation_agrees_with_the_loops() {
+    let mut failures = Failures::default();
+    let narrow = |sums: Vec<f64>| sums.iter().map(|&sum| sum as f32).collect::<Vec<f32>>();
+    for isa in isas() {
+        for (n, c, hw) in [(0, 3, 5), (1, 1, 1), (2, 3, 15), (3, 2, 16), (2, 4, 129)] {
+            let what = format!("{} n={n} c={c} hw={hw}", isa.name());
+            let (x, dy) = (numbers(1, n * c * hw), numbers(2, n * c * hw));
+            let stats: [Vec<f32>; 5] = [3, 4, 5, 6, 7].map(|seed| numbers(seed, c));
+            let [mean, inv_std, a, b, g] = &stats;
+            let (mut expected, mut actual) = (vec![0.25f64; 2 * c], vec![0.25f64; 2 * c]);
+            reference::channel_sums(c, hw, &x, &mut expected);
+            norm::channel_sums(isa, n, c, hw, &x, &mut actual);
+            failures.compare(&format!("channel_sums {what}"), &narrow(actual), &narrow(expected), 1e-6);
+            let (mut expected, mut actual) = (vec![0.25f64; 2 * c], vec![0.25f64; 2 * c]);
+            reference::norm_backward_sums((c, hw), &x, &dy, mean, inv_std, &mut expected);
+            norm::norm_backward_sums(isa, n, c, hw, &x, &dy, mean, inv_std, &mut actual);
+            failures.compare(&format!("norm_backward_sums {what}"), &narrow(actual), &narrow(expected), 1e-6);
+            let (mut expected, mut actual) = (nans(x.len()), nans(x.len()));
+            reference::normalize(c, hw, &x, a, b, &mut expected);
+            norm::normalize(isa, n, c, hw, &x, a, b, &mut actual);
+            failures.compare(&format!("normalize {what}"), &actual, &expected, 1e-6);
+            let (mut expected, mut actual) = (nans(x.len()), nans(x.len()));
+            reference::norm_backward((c, hw), &x, &dy, [mean, inv_std, a, b, g], &mut expected);
+            norm::norm_backward(isa, n, c, hw, &x, &dy, mean, inv_std, a, b, g, &mut actual);
+            failures.compare(&format!("norm_backward {what}"), &actual, &expected, 1e-6);
+        }
+    }
+    failures.report();
+}
+
+#[test]
+fn updates_agree_with_the_loops() {
+    let mut failures = Failures::default();
+    let step = AdamStep {
+        lr: 0.01,
+        beta1: 0.9,
+        beta2: 0.99,
+        epsilon: 1e-7,
+        bias_correction1: 0.19,
+        bias_correction2: 0.0199,
+        l2: 0.1,
+        decoupled_decay: 0.2,
+    };
+    for isa in isas() {
+        for &len in LENGTHS {
+            let what = format!("{} {len}", isa.name());
+            let (grads, v) = (numbers(2, len), numbers(4, len).iter().map(|v| v.abs()).collect::<Vec<_>>());
+            let mut expected = [numbers(1, len), numbers(3, len), v];
+            let mut actual = expected.clone();
+            let [p, m, v] = &mut expected;
+            reference::adam(&step, p, &grads, m, v);
+            let [p, m, v] = &mut actual;
+            update::adam(isa, &step, p, &grads, m, v);
+            failures.compare(&format!("adam {what}"), &actual.concat(), &expected.concat(), 1e-6);
+
+            let mut expected = [numbers(1, len), numbers(3, len)];
+            let mut actual = expected.clone();
+            let [p, velocity] = &mut expected;
+            reference::sgd_momentum(0.1, 0.9, 0.01, p, &grads, velocity);
+            let [p, velocity] = &mut actual;
+            update::sgd_momentum(isa, 0.1, 0.9, 0.01, p, &grads, velocity);
+            failures.compare(&format!("sgd_momentum {what}"), &actual.concat(), &expected.concat(), 1e-6);
+
+            let [mut sum, mut scaled] = [numbers(1, len), numbers(1, len)];
+            update::sum_into(isa, &mut sum, &grads);
+            update::scale(isa, &mut scaled, -3.0);
+            let x = numbers(1, len);
+            let expected: Vec<f32> = x.iter().zip(&grads).map(|(x, g)| x + g).collect();
+            failures.compare(&format!("sum_into {what}"), &sum, &expected, 0.0);
+            let expected: Vec<f32> = x.iter().map(|x| x * -3.0).collect();
+            failures.compare(&format!("scale {what}"), &scaled, &expected, 0.0);
+            let expected: f64 = x.iter().map(|&x| f64::from(x).powi(2)).sum();
+            let actual = update::sum_of_squares(isa, &x);
+            failures.compare(&format!("sum_of_squares {what}"), &[actual as f32], &[expected as f32], 1e-6);
+        }
+    }
+    failures.report();
+}
+
+#[test]
+fn pixels_agree_with_the_loops() {
+    let mut failures = Failures::default();
+    for isa in isas() {
+        for len in [0, 1, 15, 16, 17, 256, 1027] {
+            let src: Vec<u8> = (0..len).map(|i| (i * 7 % 256) as u8).collect();
+            let (mut expected, mut actual) = (nans(len), nans(len));
+            reference::u8_to_f32(&src, 1.0 / 127.5, -1.0, &mut expected);
+            pixels::u8_to_f32(isa, &src, 1.0 / 127.5, -1.0, &mut actual);
+            failures.compare(&format!("u8_to_f32 {} {len}", isa.name()), &actual, &expected, 1e-6);
+        }
+    }
+    failures.report();
+}
