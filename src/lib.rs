@@ -2,12 +2,14 @@
 #![forbid(unsafe_code)]
 
 pub mod atomic_file;
+pub mod cli;
 pub mod dataset;
 pub mod error;
 pub mod layers;
 pub mod model_file;
 pub mod network;
 pub mod optimizer;
+pub mod pilot;
 pub mod random;
 pub mod recipe;
 pub mod report;

@@ -1,4 +1,8 @@
 //! The `steersman` command.
 #![forbid(unsafe_code)]
 
-fn main() {}
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    steersman::cli::main()
+}

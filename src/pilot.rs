@@ -1,6 +1,7 @@
 //! A trained model at the wheel: image in, steering out.
 
 use std::path::Path;
+use std::sync::Arc;
 
 use steersman_kernels::Isa;
 
@@ -14,7 +15,7 @@ use crate::recipe::Recipe;
 /// A model with everything planned to predict one image after the other on the calling thread.
 ///
 /// The same code evaluates recordings, answers `predict` and drives, so all of them see an image alike. After the first image
-/// of a size nothing is allocated.
+/// of a size nothing is allocated. Clones share the network; give each thread its own.
 ///
 /// ```no_run
 /// use std::path::Path;
@@ -26,16 +27,22 @@ use crate::recipe::Recipe;
 /// println!("{steering:+.3}, that is {:+.1} degrees", pilot.recipe().full_lock_deg * f64::from(steering));
 /// # Ok::<(), steersman::Error>(())
 /// ```
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub struct Pilot {
-    recipe: Recipe,
-    network: Network,
-    parameters: Parameters,
+    model: Arc<Loaded>,
     plan: InferencePlan,
     preprocessor: Preprocessor,
     image: RgbImage,
     planes: Vec<u8>,
     input: Vec<f32>,
+}
+
+/// What the clones of a pilot share.
+#[derive(Debug)]
+struct Loaded {
+    recipe: Recipe,
+    network: Network,
+    parameters: Parameters,
 }
 
 impl Pilot {
@@ -63,15 +70,13 @@ impl Pilot {
             image: RgbImage::default(),
             planes: vec![0; recipe.preprocessing.output_len()],
             input: vec![0.0; recipe.preprocessing.output_len()],
-            recipe,
-            network,
-            parameters,
+            model: Arc::new(Loaded { recipe, network, parameters }),
         })
     }
 
     /// How the model was made.
     pub fn recipe(&self) -> &Recipe {
-        &self.recipe
+        &self.model.recipe
     }
 
     /// Steering for an RGB image, `[height][width][3]`. Roughly in [−1, 1], positive to the right; not clamped.
@@ -84,12 +89,12 @@ impl Pilot {
             return Err(Error::Usage(format!("{} bytes are no RGB image of {width}x{height} pixels", rgb.len())));
         }
         if self.preprocessor.image_size() != [height, width] {
-            self.preprocessor = self.recipe.preprocessing.plan(height, width)?;
+            self.preprocessor = self.model.recipe.preprocessing.plan(height, width)?;
         }
         self.preprocessor.apply(rgb, &mut self.planes);
-        self.recipe.preprocessing.to_input(&self.planes, &mut self.input);
+        self.model.recipe.preprocessing.to_input(&self.planes, &mut self.input);
         let mut steering = [0.0];
-        self.plan.run(&self.network, &self.parameters, &self.input, &mut steering);
+        self.plan.run(&self.model.network, &self.model.parameters, &self.input, &mut steering);
         Ok(steering[0])
     }
 

@@ -11,13 +11,13 @@ use crate::tensor::Shape;
 const GROUP: usize = 8;
 
 /// The buffers of evaluation, planned once for a network and a largest batch.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub struct InferencePlan {
     workers: Vec<Worker>,
     capacity: usize,
 }
 
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 struct Worker {
     buffers: [Vec<f32>; 2],
     scratch: Vec<f32>,

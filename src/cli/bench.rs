@@ -1,0 +1,163 @@
+//! `steersman bench`: the engine alone, on random arrays in memory.
+
+use std::time::Instant;
+
+use clap::Args;
+use serde::Serialize;
+use steersman_kernels::Isa;
+use steersman_kernels::peak::measure_peak_gflops;
+
+use super::{RecipeArgs, pool, print_json};
+use crate::error::{Error, Result};
+use crate::network::{InferencePlan, Network, Parameters, StepInput, TrainingPlan};
+use crate::optimizer::Optimizer;
+use crate::random::{Purpose, rng, uniform};
+use crate::recipe::Recipe;
+
+/// How many batches of random images are held in memory.
+const BATCHES: usize = 8;
+
+/// Measure training and prediction of a network on random arrays: no files, no decoding
+#[derive(Debug, Args)]
+pub struct BenchArgs {
+    #[command(flatten)]
+    recipe: RecipeArgs,
+    /// Images in a batch
+    #[arg(long, default_value_t = 128)]
+    batch: usize,
+    /// Threads; 0 is one for each core
+    #[arg(long, default_value_t = 0)]
+    threads: usize,
+    /// Seconds for each of the measurements
+    #[arg(long, default_value_t = 3.0)]
+    seconds: f64,
+    /// Print one JSON object as the last line
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Serialize)]
+struct BenchResult {
+    train_images_per_second: f64,
+    /// Arithmetic of convolutions and dense layers: two operations a multiply-add, training as three forward passes.
+    train_gflops: f64,
+    /// One image on one thread.
+    infer_us_p50: f64,
+    infer_us_p99: f64,
+    /// Whole batches on all threads.
+    infer_images_per_second: f64,
+    /// Fused multiply-adds in registers, all threads at once, in the same run.
+    peak_gflops: f64,
+    /// From the start of the process to the end of the first training step.
+    first_step_s: f64,
+    /// Absent where the system does not tell.
+    peak_rss_mb: Option<f64>,
+    isa: &'static str,
+    threads: usize,
+}
+
+pub fn run(args: BenchArgs, started: Instant) -> Result<()> {
+    if args.batch == 0 || !(args.seconds > 0.0 && args.seconds < 1e6) {
+        return Err(Error::Usage("--batch and --seconds must be positive".into()));
+    }
+    let recipe = args.recipe.find()?;
+    let pool = pool(args.threads)?;
+    let result = pool.install(|| measure(&recipe, &args, started))?;
+    if args.json {
+        return print_json(&result);
+    }
+    let share = 100.0 * result.train_gflops / result.peak_gflops;
+    println!("{}, batch {}, {} threads, {}", recipe.name, args.batch, result.threads, result.isa);
+    println!("training      {:>9.0} images/s   {:.1} GFLOP/s, {share:.1} % of {:.0}", result.train_images_per_second, result.train_gflops, result.peak_gflops);
+    println!("prediction    {:>9.0} images/s", result.infer_images_per_second);
+    println!("one image     {:>9.0} us median  {:.0} us p99 (1 thread)", result.infer_us_p50, result.infer_us_p99);
+    println!("first step    {:>9.3} s after the start", result.first_step_s);
+    if let Some(megabytes) = result.peak_rss_mb {
+        println!("peak memory   {megabytes:>9.0} MB");
+    }
+    Ok(())
+}
+
+fn measure(recipe: &Recipe, args: &BenchArgs, started: Instant) -> Result<BenchResult> {
+    let network = recipe.network(Isa::best())?;
+    let mut parameters = network.initialize(1);
+    let mut random = rng(1, Purpose::Test, 0, 0);
+    let mut fill = |len: usize| (0..len).map(|_| uniform(&mut random, -0.5, 0.5) as f32).collect::<Vec<f32>>();
+    let x: Vec<Vec<f32>> = (0..BATCHES).map(|_| fill(args.batch * network.input().len())).collect();
+    let labels: Vec<Vec<f32>> = (0..BATCHES).map(|_| fill(args.batch)).collect();
+
+    let mut plan = TrainingPlan::new(&network, args.batch);
+    let mut optimizer = Optimizer::new(recipe.optimizer, recipe.clip_gradient_norm, &network);
+    let mut step = 0;
+    let mut train_step = |parameters: &mut Parameters| {
+        let batch = step % BATCHES;
+        let input = StepInput { x: &x[batch], labels: &labels[batch], seed: 1, step: step as u64 };
+        plan.step(&network, parameters, &recipe.loss, input);
+        let norm = plan.gradient_norm();
+        optimizer.step(recipe.optimizer.learning_rate(), &mut parameters.values, plan.gradient_mut(), norm);
+        step += 1;
+    };
+    train_step(&mut parameters);
+    let first_step_s = started.elapsed().as_secs_f64();
+
+    let (mut steps, training) = (0, Instant::now());
+    while training.elapsed().as_secs_f64() < args.seconds {
+        train_step(&mut parameters);
+        steps += 1;
+    }
+    let train_images_per_second = (steps * args.batch) as f64 / training.elapsed().as_secs_f64();
+
+    let infer_images_per_second = infer_throughput(&network, &parameters, &x, args);
+    let (infer_us_p50, infer_us_p99) = infer_latency(&network, &parameters, &x[0], args.seconds);
+    let peaks = rayon::broadcast(|_| measure_peak_gflops(network.isa(), args.seconds.min(1.0)));
+    Ok(BenchResult {
+        train_images_per_second,
+        train_gflops: train_images_per_second * network.multiply_adds() as f64 * 2.0 * 3.0 / 1e9,
+        infer_us_p50,
+        infer_us_p99,
+        infer_images_per_second,
+        peak_gflops: peaks.iter().sum(),
+        first_step_s,
+        peak_rss_mb: peak_rss_mb(),
+        isa: network.isa().name(),
+        threads: rayon::current_num_threads(),
+    })
+}
+
+fn infer_throughput(network: &Network, parameters: &Parameters, x: &[Vec<f32>], args: &BenchArgs) -> f64 {
+    let mut plan = InferencePlan::new(network, args.batch);
+    let mut y = vec![0.0; args.batch];
+    plan.run(network, parameters, &x[0], &mut y);
+    let (mut batches, started) = (0, Instant::now());
+    while started.elapsed().as_secs_f64() < args.seconds {
+        plan.run(network, parameters, &x[batches % BATCHES], &mut y);
+        batches += 1;
+    }
+    (batches * args.batch) as f64 / started.elapsed().as_secs_f64()
+}
+
+/// Median and 99th percentile of the time for one image, in microseconds.
+fn infer_latency(network: &Network, parameters: &Parameters, x: &[f32], seconds: f64) -> (f64, f64) {
+    let mut plan = InferencePlan::new(network, 1);
+    let mut times = Vec::new();
+    let started = Instant::now();
+    for image in x.chunks_exact(network.input().len()).cycle() {
+        let before = Instant::now();
+        plan.run(network, parameters, image, &mut [0.0]);
+        times.push(before.elapsed().as_secs_f64() * 1e6);
+        if started.elapsed().as_secs_f64() >= seconds {
+            break;
+        }
+    }
+    times.sort_by(f64::total_cmp);
+    let percentile = |p: usize| times[(times.len() - 1) * p / 100];
+    (percentile(50), percentile(99))
+}
+
+/// Largest resident memory of this process so far, in millions of bytes, where the system tells (Linux).
+fn peak_rss_mb() -> Option<f64> {
+    let status = std::fs::read_to_string("/proc/self/status").ok()?;
+    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
+    let kibibytes: f64 = line.trim().trim_end_matches("kB").trim().parse().ok()?;
+    Some(kibibytes * 1024.0 / 1e6)
+}

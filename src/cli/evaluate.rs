@@ -1,0 +1,94 @@
+//! `steersman evaluate`: a model against recordings.
+
+use std::collections::BTreeSet;
+use std::path::PathBuf;
+
+use clap::Args;
+use rayon::prelude::*;
+use steersman_kernels::Isa;
+
+use super::{or_dash, pool, print_json};
+use crate::dataset::{self, Camera, Recording, row_id};
+use crate::error::{Error, Result};
+use crate::model_file::Model;
+use crate::pilot::Pilot;
+use crate::report::{Metrics, Prediction};
+
+/// Compare a model's steering with what was recorded: centre camera, every usable row
+#[derive(Debug, Args)]
+pub struct EvaluateArgs {
+    /// Model file
+    model: PathBuf,
+    /// Udacity logs or donkeycar tubs
+    #[arg(required = true, value_name = "RECORDING")]
+    recordings: Vec<PathBuf>,
+    /// Threads; 0 is one for each core
+    #[arg(long, default_value_t = 0)]
+    threads: usize,
+    /// Print one JSON object as the last line
+    #[arg(long)]
+    json: bool,
+}
+
+pub fn run(args: EvaluateArgs) -> Result<()> {
+    let model = Model::load(&args.model)?;
+    let trained_on: BTreeSet<u64> = model.training_rows.iter().copied().collect();
+    let full_lock_deg = model.recipe.full_lock_deg;
+    let pilot = Pilot::new(model, Isa::best())?;
+
+    let mut predictions = Vec::new();
+    let (mut known, mut sessions_before) = (0, 0);
+    for path in &args.recordings {
+        let recording = dataset::load(path)?;
+        recording.require_usable()?;
+        for notice in &recording.notices {
+            eprintln!("{}: {notice}", path.display());
+        }
+        known += (0..recording.rows.len()).filter(|row| trained_on.contains(&row_id(&recording, *row))).count();
+        predictions.extend(pool(args.threads)?.install(|| predict(&pilot, &recording, sessions_before)));
+        sessions_before += recording.sessions.len();
+    }
+    let metrics = Metrics::of(&predictions, full_lock_deg)
+        .ok_or_else(|| Error::Usage("no image of these recordings can be decoded".into()))?;
+    if known > 0 {
+        eprintln!(
+            "note: {known} of {} rows belong to the model's training split: this is no test of how well it generalises",
+            metrics.rows
+        );
+    }
+    if args.json {
+        return print_json(&metrics);
+    }
+    println!("rows                       {}", metrics.rows);
+    println!("MSE                        {:.5}", metrics.mse);
+    println!("MSE / predicting zero      {}", or_dash(metrics.relative_to_zero, 3));
+    println!("R2                         {}", or_dash(metrics.r2, 3));
+    println!("MAE                        {:.2} deg", metrics.mae_deg);
+    println!("RMSE                       {:.2} deg", metrics.rmse_deg);
+    println!("MAE left/straight/right    {} / {} / {} deg", or_dash(metrics.mae_left_deg, 2), or_dash(metrics.mae_straight_deg, 2), or_dash(metrics.mae_right_deg, 2));
+    println!("bias                       {:+.2} deg", metrics.bias_deg);
+    println!("whiteness                  {} deg/s", or_dash(metrics.whiteness_deg_s, 1));
+    Ok(())
+}
+
+/// Predictions for the centre images of all rows; images that cannot be decoded are reported and left out.
+fn predict(pilot: &Pilot, recording: &Recording, sessions_before: usize) -> Vec<Prediction> {
+    let session_of = |row: usize| recording.sessions.partition_point(|session| session.end <= row);
+    let predict_row = |pilot: &mut Pilot, row: usize| {
+        let path = recording.image_path(row, Camera::Centre)?;
+        match pilot.steer_file(&path) {
+            Ok(steering) => Some(Prediction {
+                steering,
+                label: recording.rows[row].steering,
+                session: sessions_before + session_of(row),
+                time_s: recording.rows[row].time_ms as f64 / 1000.0,
+            }),
+            Err(error) => {
+                eprintln!("left out: {error}");
+                None
+            }
+        }
+    };
+    let rows = (0..recording.rows.len()).into_par_iter();
+    rows.map_init(|| pilot.clone(), predict_row).flatten().collect()
+}

@@ -1,0 +1,95 @@
+//! The commands, one file each: its arguments and `run`.
+//!
+//! Results go to standard output, everything else to standard error. With `--json` the last line of standard output is one
+//! JSON value. Exit codes: 0 done, 1 error, 2 wrong arguments, 130 interrupted.
+
+mod bench;
+mod evaluate;
+mod inspect;
+mod predict;
+mod progress;
+mod summary;
+mod train;
+
+use std::process::ExitCode;
+use std::time::Instant;
+
+use clap::{Args, Parser, Subcommand};
+use serde::Serialize;
+
+use crate::error::{Error, Result};
+use crate::recipe::Recipe;
+
+/// Learn to steer a car from its front camera, and drive with what was learned.
+#[derive(Debug, Parser)]
+#[command(name = "steersman", version, about, propagate_version = true, max_term_width = 100)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    Train(train::TrainArgs),
+    Evaluate(evaluate::EvaluateArgs),
+    Predict(predict::PredictArgs),
+    Inspect(inspect::InspectArgs),
+    Summary(summary::SummaryArgs),
+    Bench(bench::BenchArgs),
+}
+
+/// Runs the command line of this process.
+pub fn main() -> ExitCode {
+    let started = Instant::now();
+    let result = match Cli::parse().command {
+        Command::Train(args) => train::run(args),
+        Command::Evaluate(args) => evaluate::run(args),
+        Command::Predict(args) => predict::run(args),
+        Command::Inspect(args) => inspect::run(args),
+        Command::Summary(args) => summary::run(args),
+        Command::Bench(args) => bench::run(args, started),
+    };
+    match result {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(Error::Interrupted) => ExitCode::from(130),
+        Err(error) => {
+            eprintln!("error: {error}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+/// Which recipe, and what to change in it.
+#[derive(Clone, Debug, Args)]
+struct RecipeArgs {
+    /// A built-in recipe (hyper, hyper-prelu, lenet, pilotnet) or a recipe file
+    #[arg(long, value_name = "NAME|FILE", default_value = "lenet")]
+    recipe: String,
+    /// Change an entry of the recipe, as in epochs=3 or optimizer.learning_rate=1e-4
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    overrides: Vec<String>,
+}
+
+impl RecipeArgs {
+    fn find(&self) -> Result<Recipe> {
+        Recipe::find(&self.recipe, &self.overrides)
+    }
+}
+
+/// A rayon pool of `threads` (0: one for each core).
+fn pool(threads: usize) -> Result<rayon::ThreadPool> {
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
+    pool.map_err(|e| Error::Usage(format!("cannot start {threads} threads: {e}; give a smaller number with --threads")))
+}
+
+/// Prints one JSON value as the last line.
+fn print_json(value: &impl Serialize) -> Result<()> {
+    let text = serde_json::to_string(value).map_err(|e| Error::Usage(format!("cannot be written as JSON: {e}")))?;
+    println!("{text}");
+    Ok(())
+}
+
+/// A number with `decimals`, or a dash where there is none.
+fn or_dash(value: Option<f64>, decimals: usize) -> String {
+    value.map_or("-".into(), |value| format!("{value:.decimals$}"))
+}

@@ -1,0 +1,43 @@
+//! `steersman predict`: an angle per image.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use serde::Serialize;
+
+use super::print_json;
+use crate::error::Result;
+use crate::pilot::Pilot;
+
+/// Print the steering a model gives for images
+#[derive(Debug, Args)]
+pub struct PredictArgs {
+    /// Model file
+    model: PathBuf,
+    /// JPEG or PNG images
+    #[arg(required = true, value_name = "IMAGE")]
+    images: Vec<PathBuf>,
+    /// Print one JSON array as the last line: [{"image": …, "steering": …}, …]
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Serialize)]
+struct Answer {
+    image: PathBuf,
+    steering: f32,
+}
+
+pub fn run(args: PredictArgs) -> Result<()> {
+    let mut pilot = Pilot::load(&args.model)?;
+    let full_lock_deg = pilot.recipe().full_lock_deg;
+    let mut answers = Vec::new();
+    for image in args.images {
+        let steering = pilot.steer_file(&image)?;
+        if !args.json {
+            println!("{steering:+.4}  {:+6.2} deg  {}", f64::from(steering) * full_lock_deg, image.display());
+        }
+        answers.push(Answer { image, steering });
+    }
+    if args.json { print_json(&answers) } else { Ok(()) }
+}

@@ -1,0 +1,92 @@
+//! How a run shows itself: a bar on a terminal, plain lines elsewhere.
+
+use std::io::IsTerminal;
+use std::time::{Duration, Instant};
+
+use indicatif::{ProgressBar, ProgressStyle};
+
+use super::or_dash;
+use crate::training::{EpochRecord, Observer};
+
+/// Time between plain progress lines.
+const PLAIN_INTERVAL: Duration = Duration::from_secs(10);
+
+/// Prints to standard error.
+pub struct Progress {
+    bar: Option<ProgressBar>,
+    epoch: u32,
+    epoch_started: Instant,
+    images_before: usize,
+    last_line: Instant,
+}
+
+impl Progress {
+    /// For a run that is about to begin.
+    pub fn new() -> Progress {
+        let style = "epoch {prefix} [{bar:30}] {pos}/{len} images, {msg}, {eta} left";
+        let style = ProgressStyle::with_template(style).expect("the template is valid").progress_chars("=> ");
+        let bar = std::io::stderr().is_terminal().then(|| ProgressBar::new(0).with_style(style));
+        let now = Instant::now();
+        Progress { bar, epoch: 0, epoch_started: now, images_before: 0, last_line: now }
+    }
+
+    fn print(&self, text: &str) {
+        match &self.bar {
+            Some(bar) => bar.suspend(|| eprintln!("{text}")),
+            None => eprintln!("{text}"),
+        }
+    }
+}
+
+impl Observer for Progress {
+    fn notice(&mut self, text: &str) {
+        self.print(text);
+    }
+
+    fn progress(&mut self, epoch: u32, images: usize, of: usize) {
+        if epoch != self.epoch {
+            (self.epoch, self.epoch_started, self.images_before) = (epoch, Instant::now(), images);
+            if let Some(bar) = &self.bar {
+                bar.set_prefix(epoch.to_string());
+                bar.set_length(of as u64);
+                bar.reset();
+            }
+        }
+        let rate = (images - self.images_before) as f64 / self.epoch_started.elapsed().as_secs_f64().max(1e-9);
+        match &self.bar {
+            Some(bar) => {
+                bar.set_message(format!("{rate:.0} images/s"));
+                bar.set_position(images as u64);
+            }
+            None if self.last_line.elapsed() >= PLAIN_INTERVAL => {
+                self.last_line = Instant::now();
+                let left = (of - images) as f64 / rate.max(1e-9);
+                eprintln!("epoch {epoch}: {images}/{of} images, {rate:.0} images/s, {left:.0} s left in this epoch");
+            }
+            None => {}
+        }
+    }
+
+    fn epoch(&mut self, record: &EpochRecord, of: u32) {
+        if let Some(bar) = &self.bar {
+            bar.set_position(bar.length().unwrap_or(0));
+        }
+        self.last_line = Instant::now();
+        self.print(&format!(
+            "epoch {:>2}/{of}  loss {:.4}  val {}  centre {}  MAE {} deg  {} of zero's  {:.0} images/s  {:.1} s",
+            record.epoch,
+            record.train_loss,
+            or_dash(record.val_mse, 4),
+            or_dash(record.val_center_mse, 4),
+            or_dash(record.val_mae_deg, 2),
+            or_dash(record.relative_to_zero, 2),
+            record.images as f64 / record.train_seconds,
+            record.seconds,
+        ));
+        if record.epoch == of
+            && let Some(bar) = &self.bar
+        {
+            bar.finish_and_clear();
+        }
+    }
+}

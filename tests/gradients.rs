@@ -1,0 +1,139 @@
+//! Finite differences through whole networks: the three recipes at reduced size, dropout frozen by its key.
+//!
+//! Each tensor is moved along several random directions of ±1, the loss must change as the gradient says, and the difference
+//! is measured against the norm of the tensor's gradient, which is what a random direction of signs sees of it on average.
+
+use rand::Rng;
+use steersman::network::{Network, Parameters, StepInput, TrainingPlan};
+use steersman::random::{Purpose, rng, uniform, unit};
+use steersman::recipe::Recipe;
+use steersman::tensor::Shape;
+use steersman::training::Loss;
+use steersman_kernels::Isa;
+
+const IMAGES: usize = 6;
+const DIRECTIONS: u64 = 4;
+/// Largest root-mean-square error over the directions.
+const TOLERANCE: f64 = 1e-2;
+
+/// Stripes of random direction, width and contrast. Plain noise would look alike to the network from image to image, and batch
+/// norm would blow the small differences up until only rounding is left.
+fn image(shape: Shape, low: f64, high: f64, random: &mut impl Rng) -> Vec<f32> {
+    let (dx, dy, contrast) = (uniform(random, -0.6, 0.6), uniform(random, -0.6, 0.6), uniform(random, 0.2, 1.0));
+    let mut pixels = Vec::new();
+    for _channel in 0..shape.c {
+        let phase = uniform(random, 0.0, 6.0);
+        for y in 0..shape.h {
+            for x in 0..shape.w {
+                let stripe = (dx * x as f64 + dy * y as f64 + phase).sin();
+                let value = 0.5 + 0.4 * contrast * stripe + uniform(random, -0.1, 0.1);
+                pixels.push((low + (high - low) * value) as f32);
+            }
+        }
+    }
+    pixels
+}
+
+struct Check {
+    network: Network,
+    plan: TrainingPlan,
+    x: Vec<f32>,
+    labels: Vec<f32>,
+    loss: Loss,
+    /// How much a step changes the loss, as a share of itself.
+    step: f64,
+}
+
+impl Check {
+    fn new(recipe: &str, size: &str, loss: Loss, isa: Isa) -> Check {
+        let recipe = Recipe::find(recipe, &[format!("preprocessing.resize={size}")]).unwrap();
+        let network = recipe.network(isa).unwrap();
+        let mut random = rng(11, Purpose::Test, 0, 0);
+        // Grey levels where the network scales them itself.
+        let (low, high) = if recipe.preprocessing.scale == 1.0 { (0.0, 255.0) } else { (-0.5, 0.5) };
+        Check {
+            plan: TrainingPlan::new(&network, IMAGES),
+            x: (0..IMAGES).flat_map(|_| image(network.input(), low, high, &mut random)).collect(),
+            labels: (0..IMAGES).map(|_| uniform(&mut random, -1.0, 1.0) as f32).collect(),
+            // Batch norm multiplies the rounding noise; without it, a small step keeps clear of the kinks of pooling.
+            step: if network.count(false) > 0 { 5e-4 } else { 1e-4 },
+            network,
+            loss,
+        }
+    }
+
+    fn loss(&mut self, parameters: &Parameters) -> f64 {
+        let input = StepInput { x: &self.x, labels: &self.labels, seed: 3, step: 4 };
+        self.plan.step(&self.network, &mut parameters.clone(), &self.loss, input)
+    }
+
+    /// Tensor names whose gradient is wrong, with the error.
+    fn failures(&mut self) -> Vec<String> {
+        let mut parameters = self.network.initialize(5);
+        let mut random = rng(12, Purpose::Test, 0, 0);
+        // Off the first values: biases of 0 and slopes of 0 hide mistakes.
+        parameters.values.iter_mut().for_each(|p| *p += uniform(&mut random, -0.05, 0.05) as f32);
+        let loss = self.loss(&parameters);
+        let gradient = self.plan.gradient().to_vec();
+        let tensors: Vec<_> = self.network.tensors().iter().filter(|t| t.trainable).cloned().collect();
+        let mut failures = Vec::new();
+        for (index, tensor) in tensors.iter().enumerate() {
+            let gradient = &gradient[tensor.range.clone()];
+            let norm = gradient.iter().map(|g| f64::from(*g).powi(2)).sum::<f64>().sqrt();
+            let layer = self.network.layers().iter().position(|l| l.params.contains(&tensor.range.start)).unwrap();
+            let cancelled = self.network.layers().get(layer + 1).is_some_and(|l| l.layer.batch_statistics().is_some());
+            if cancelled && tensor.spec.name == "bias" {
+                continue; // batch norm takes away what a bias right before it adds
+            }
+            let step = (self.step * loss / norm) as f32;
+            let mut squares = 0.0;
+            for direction in 0..DIRECTIONS {
+                let mut signs = rng(13, Purpose::Test, direction, index as u64);
+                let signs: Vec<f32> = gradient.iter().map(|_| if unit(&mut signs) < 0.5 { -1.0 } else { 1.0 }).collect();
+                let mut moved = |factor: f32| {
+                    let mut parameters = parameters.clone();
+                    for (p, sign) in parameters.tensor_mut(tensor).iter_mut().zip(&signs) {
+                        *p += factor * step * sign;
+                    }
+                    self.loss(&parameters)
+                };
+                let numerical = (moved(1.0) - moved(-1.0)) / (2.0 * f64::from(step));
+                let analytic: f64 = gradient.iter().zip(&signs).map(|(g, s)| f64::from(g * s)).sum();
+                squares += ((numerical - analytic) / norm).powi(2);
+            }
+            let error = (squares / DIRECTIONS as f64).sqrt();
+            let ok = error <= TOLERANCE;
+            if !ok {
+                failures.push(format!("{}: {error:.1e}", tensor.name));
+            }
+        }
+        failures
+    }
+}
+
+fn check(recipe: &str, size: &str) {
+    for loss in [Loss::MeanSquaredError, Loss::Huber { delta: 0.3 }] {
+        let failures = Check::new(recipe, size, loss, Isa::best()).failures();
+        assert!(failures.is_empty(), "{recipe}, {loss:?}: gradients off by more than {TOLERANCE}: {failures:?}");
+    }
+}
+
+#[test]
+fn hyper_at_reduced_width() {
+    check("hyper", "[40, 44]");
+}
+
+#[test]
+fn hyper_prelu_at_reduced_width() {
+    check("hyper-prelu", "[80, 44]");
+}
+
+#[test]
+fn lenet_at_reduced_size() {
+    check("lenet", "[26, 30]");
+}
+
+#[test]
+fn pilotnet_at_reduced_size() {
+    check("pilotnet", "[61, 65]");
+}

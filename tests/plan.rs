@@ -1,0 +1,151 @@
+//! What a planned network promises: no allocation in the steady state, the same bits for any number of threads and any
+//! capacity of the plan, and an evaluation that changes nothing.
+
+use std::sync::Mutex;
+
+use steersman::network::{InferencePlan, Network, Parameters, StepInput, TrainingPlan};
+use steersman::optimizer::Optimizer;
+use steersman::random::{Purpose, rng, uniform};
+use steersman::recipe::Recipe;
+use steersman_kernels::Isa;
+
+#[global_allocator]
+static ALLOCATOR: dhat::Alloc = dhat::Alloc;
+
+/// Allocations are counted for the whole process: one test at a time.
+static ALONE: Mutex<()> = Mutex::new(());
+
+struct Setup {
+    recipe: Recipe,
+    network: Network,
+    x: Vec<f32>,
+    labels: Vec<f32>,
+}
+
+impl Setup {
+    fn new(recipe: &str, size: &str, images: usize) -> Setup {
+        let recipe = Recipe::find(recipe, &[format!("preprocessing.resize={size}")]).unwrap();
+        let network = recipe.network(Isa::best()).unwrap();
+        let mut random = rng(1, Purpose::Test, 0, 0);
+        let x = (0..images * network.input().len()).map(|_| uniform(&mut random, -0.5, 0.5) as f32).collect();
+        let labels = (0..images).map(|_| uniform(&mut random, -1.0, 1.0) as f32).collect();
+        Setup { recipe, network, x, labels }
+    }
+
+    fn optimizer(&self) -> Optimizer {
+        Optimizer::new(self.recipe.optimizer, Some(0.1), &self.network)
+    }
+
+    fn step(&self, plan: &mut TrainingPlan, optimizer: &mut Optimizer, parameters: &mut Parameters) -> f64 {
+        let input = StepInput { x: &self.x, labels: &self.labels, seed: 1, step: optimizer.updates };
+        let loss = plan.step(&self.network, parameters, &self.recipe.loss, input);
+        let norm = plan.gradient_norm();
+        optimizer.step(1e-3, &mut parameters.values, plan.gradient_mut(), norm);
+        loss
+    }
+
+    /// Losses and weights after three steps in a pool of `threads`, with a plan for `capacity` images.
+    fn train(&self, threads: usize, capacity: usize) -> (Vec<f64>, Parameters) {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| {
+            let (mut plan, mut optimizer) = (TrainingPlan::new(&self.network, capacity), self.optimizer());
+            let mut parameters = self.network.initialize(1);
+            let losses = (0..3).map(|_| self.step(&mut plan, &mut optimizer, &mut parameters)).collect();
+            (losses, parameters)
+        })
+    }
+}
+
+const NETWORKS: [(&str, &str); 3] = [("hyper", "[40, 44]"), ("lenet", "[30, 26]"), ("pilotnet", "[61, 65]")];
+
+#[test]
+fn a_training_step_allocates_nothing() {
+    let _alone = ALONE.lock().unwrap();
+    let _profiler = dhat::Profiler::builder().testing().build();
+    for (recipe, size) in NETWORKS {
+        let setup = Setup::new(recipe, size, 37);
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(2).build().unwrap();
+        let allocated = pool.install(|| {
+            let (mut plan, mut optimizer) = (TrainingPlan::new(&setup.network, 37), setup.optimizer());
+            let mut parameters = setup.network.initialize(1);
+            for _ in 0..3 {
+                setup.step(&mut plan, &mut optimizer, &mut parameters);
+            }
+            let before = dhat::HeapStats::get().total_blocks;
+            for _ in 0..20 {
+                setup.step(&mut plan, &mut optimizer, &mut parameters);
+            }
+            dhat::HeapStats::get().total_blocks - before
+        });
+        assert_eq!(allocated, 0, "{recipe}");
+    }
+}
+
+#[test]
+fn a_prediction_allocates_nothing() {
+    let _alone = ALONE.lock().unwrap();
+    let _profiler = dhat::Profiler::builder().testing().build();
+    for (recipe, size) in NETWORKS {
+        let setup = Setup::new(recipe, size, 1);
+        let (parameters, mut plan) = (setup.network.initialize(1), InferencePlan::new(&setup.network, 1));
+        plan.run(&setup.network, &parameters, &setup.x, &mut [0.0]);
+        let before = dhat::HeapStats::get().total_blocks;
+        plan.run(&setup.network, &parameters, &setup.x, &mut [0.0]);
+        assert_eq!(dhat::HeapStats::get().total_blocks, before, "{recipe}");
+    }
+}
+
+#[test]
+fn training_gives_the_same_bits_for_any_number_of_threads_and_any_capacity() {
+    let _alone = ALONE.lock().unwrap();
+    for (recipe, size) in NETWORKS {
+        for images in [1, 3, 37] {
+            let setup = Setup::new(recipe, size, images);
+            let one = setup.train(1, images);
+            for (threads, capacity) in [(2, images), (5, images), (2, 64)] {
+                assert!(one == setup.train(threads, capacity), "{recipe}, {images} images, {threads} threads");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_prediction_does_not_depend_on_the_other_images() {
+    let _alone = ALONE.lock().unwrap();
+    for (recipe, size) in NETWORKS {
+        let setup = Setup::new(recipe, size, 21);
+        let parameters = setup.network.initialize(1);
+        let (mut together, mut single) = ([f32::NAN; 21], [f32::NAN; 21]);
+        InferencePlan::new(&setup.network, 21).run(&setup.network, &parameters, &setup.x, &mut together);
+        let mut plan = InferencePlan::new(&setup.network, 1);
+        for (x, y) in setup.x.chunks(setup.network.input().len()).zip(single.chunks_mut(1)) {
+            plan.run(&setup.network, &parameters, x, y);
+        }
+        for (a, b) in together.iter().zip(single) {
+            approx::assert_relative_eq!(*a, b, max_relative = 1e-4, epsilon = 1e-5);
+        }
+    }
+}
+
+#[test]
+fn a_network_can_learn_eight_images_by_heart() {
+    let _alone = ALONE.lock().unwrap();
+    for (recipe, size) in NETWORKS {
+        let setup = Setup::new(recipe, size, 8);
+        // Dropout is there to prevent just this.
+        let layers: Vec<_> = setup
+            .recipe
+            .layers
+            .iter()
+            .filter(|layer| !matches!(layer, steersman::network::LayerSpec::Dropout { .. }))
+            .cloned()
+            .collect();
+        let network = Network::new(setup.network.input(), &layers, Isa::best()).unwrap();
+        let setup = Setup { network, ..setup };
+        let (mut plan, mut optimizer) = (TrainingPlan::new(&setup.network, 8), setup.optimizer());
+        let mut parameters = setup.network.initialize(1);
+        let first = setup.step(&mut plan, &mut optimizer, &mut parameters);
+        let last = (0..300).map(|_| setup.step(&mut plan, &mut optimizer, &mut parameters)).last().unwrap();
+        assert!(last < first / 100.0, "{recipe}: from {first} to {last}");
+    }
+}
