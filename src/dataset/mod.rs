@@ -1,5 +1,7 @@
 //! Recordings: reading, splitting, preprocessing and loading them.
 
+pub mod augment;
+pub mod cache;
 pub mod colour;
 mod decimal_comma;
 pub mod decode;
@@ -7,6 +9,7 @@ mod driving_log;
 mod files;
 pub mod leak;
 mod load;
+pub mod loader;
 pub mod preprocess;
 mod recording;
 pub mod resize;
