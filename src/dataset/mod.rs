@@ -7,6 +7,7 @@ mod decimal_comma;
 pub mod decode;
 mod driving_log;
 mod files;
+pub mod inspect;
 pub mod leak;
 mod load;
 pub mod loader;
