@@ -168,7 +168,7 @@ mod tests {
     #[test]
     fn brightness_scales_and_clamps() {
         let augmentation = Augmentation { brightness: Some([1.5, 1.5]), ..Default::default() };
-        let mut rgb = vec![0, 100, 200, 255].repeat(30);
+        let mut rgb = [0, 100, 200, 255].repeat(30);
         assert_eq!(augmentation.apply(&preprocessing(), &mut rgb, &mut rng(1, Purpose::Test, 0, 0)), 0.0);
         assert_eq!(rgb[..4], [0, 150, 255, 255]);
     }
