@@ -222,7 +222,7 @@ fn bars(histogram: &[usize]) -> String {
         let centre = i as f64 / 10.0 - 1.0;
         let bar = "#".repeat((count * BAR).div_ceil(most));
         // Writing to a string cannot fail.
-        let _ = writeln!(text, "          {centre:+.1} {count:>7} {bar}");
+        let _ = writeln!(text, "{}", format!("          {centre:+.1} {count:>7} {bar}").trim_end());
     }
     text
 }
