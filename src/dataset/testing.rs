@@ -1,4 +1,4 @@
-//! Helpers of the tests of this module.
+//! What the tests of this module share.
 
 use super::files::Files;
 use super::recording::{Camera, Kind, Recording, Row, Unusable};
