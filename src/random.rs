@@ -4,7 +4,7 @@
 //! block cipher in counter mode, so any thread can open any stream at any time and reads the same numbers: this is why
 //! one seed gives the same weights for 1, 2 or 5 threads, with and without a cache.
 //!
-//! The few helpers here ([`unit`], [`uniform`], [`below`], [`shuffle`]) are written out, not taken from the `rand`
+//! The few functions here ([`unit()`], [`uniform`], [`below`], [`shuffle`]) are written out, not taken from the `rand`
 //! crate, so that an update of that crate cannot change the course of a run.
 
 use rand::{Rng, SeedableRng};

@@ -251,6 +251,16 @@ mod tests {
     }
 
     #[test]
+    fn the_saturation_plane_is_that_of_hsv() {
+        let pixels: Vec<u8> = (0..=255_u8).flat_map(|max| (0..=max).flat_map(move |min| [min, max, min])).collect();
+        let n = pixels.len() / 3;
+        let (mut hsv, mut saturation) = (vec![0; 3 * n], vec![0; n]);
+        Colour::Hsv.planes(&pixels, &mut hsv);
+        Colour::Saturation.planes(&pixels, &mut saturation);
+        assert_eq!(hsv[n..2 * n], saturation);
+    }
+
+    #[test]
     fn planes_are_planar() {
         let mut out = [0; 6];
         Colour::Rgb.planes(&[1, 2, 3, 4, 5, 6], &mut out);

@@ -105,7 +105,7 @@ fn read_log(path: &Path, log_path: &Path, check: ImageCheck) -> Result<Recording
         }
     }
     let headers = log.headers;
-    let mut recording = builder.finish()?;
+    let mut recording = builder.finish(&place)?;
     if headers > 1 {
         recording.notices.push(format!("the log has {headers} header lines: several logs were put together"));
     }
@@ -127,7 +127,7 @@ fn read_tub(path: &Path, folder: &Path, check: ImageCheck) -> Result<Recording> 
         }
     }
     let deleted = tub.deleted;
-    let mut recording = builder.finish()?;
+    let mut recording = builder.finish("catalogs")?;
     recording.notices.push("a tub has one camera: side cameras of a recipe fall away".into());
     if deleted > 0 {
         recording.notices.push(format!("{deleted} records marked as deleted are left out"));
@@ -230,7 +230,7 @@ impl Builder {
         Ok(())
     }
 
-    fn finish(mut self) -> Result<Recording> {
+    fn finish(mut self, log: &str) -> Result<Recording> {
         self.look_at_images()?;
         let mut recording = Recording {
             path: self.path,
@@ -243,7 +243,7 @@ impl Builder {
             times_plausible: true,
             files: self.files,
         };
-        recording.settle();
+        recording.settle(log);
         recording.image_size = recording
             .image_path(0, Camera::Centre)
             .and_then(|path| fs::read(path).ok())

@@ -74,6 +74,8 @@ fn unusable_rows_are_counted_by_reason_with_examples() {
     let example = &recording.unusable.0[&Reason::LabelOutOfRange].examples[0];
     assert_eq!(example, "driving_log.csv:31: steering 7 is not in [-1, 1]");
     assert!(recording.unusable.0[&Reason::ImageMissing].examples[0].starts_with("driving_log.csv:4: "));
+    let missing = &recording.unusable.0[&Reason::ImageMissing].examples;
+    assert_eq!(missing[1], "driving_log.csv:5: left image");
     let message = recording.require_usable().unwrap_err().to_string();
     assert!(message.contains("7 of 32 rows"), "{message}");
 }

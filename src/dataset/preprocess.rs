@@ -105,6 +105,14 @@ impl Preprocessing {
         self.source[1] as f64 / self.rgb_size()[1] as f64
     }
 
+    /// A notice for the reader where images of `size` (height, width) are scaled to `source` before anything else.
+    pub fn size_notice(&self, size: [usize; 2]) -> Option<String> {
+        let ([h, w], [source_h, source_w]) = (size, self.source);
+        (size != self.source).then(|| {
+            format!("images of {w}x{h} pixels are scaled to {source_w}x{source_h}, which the recipe is written for")
+        })
+    }
+
     /// Plans the preprocessing of images of `height` x `width` pixels.
     ///
     /// # Errors
@@ -278,6 +286,8 @@ mod tests {
         let mut planes = vec![0; small().output_len()];
         small().plan(4, 5).unwrap().apply(&grey, &mut planes);
         assert!(planes.iter().all(|&x| x == 77));
+        assert_eq!(small().size_notice([8, 12]), None);
+        assert!(small().size_notice([4, 5]).unwrap().contains("5x4 pixels are scaled to 12x8"));
     }
 
     #[test]

@@ -232,15 +232,16 @@ impl Recording {
         Ok(())
     }
 
-    /// Decides what the whole recording tells: cameras, times, sessions. Called once, when all rows are read.
-    pub(super) fn settle(&mut self) {
-        self.settle_side_cameras();
+    /// Decides what the whole recording tells: cameras, times, sessions. Called once, when all rows are read;
+    /// `log` names the file in examples.
+    pub(super) fn settle(&mut self, log: &str) {
+        self.settle_side_cameras(log);
         self.settle_times();
         self.settle_sessions();
     }
 
     /// A side camera without a single good image falls away; otherwise rows whose side image is bad are left out.
-    fn settle_side_cameras(&mut self) {
+    fn settle_side_cameras(&mut self, log: &str) {
         let mut fallen = [false; 2];
         for (side, fallen) in fallen.iter_mut().enumerate() {
             let named = self.rows.iter().any(|row| row.side_faults[side].is_some());
@@ -250,13 +251,12 @@ impl Recording {
                 self.notices.push(format!("no image of the {camera} camera can be read; the camera falls away"));
             }
         }
-        let log = self.path.clone();
         let Self { rows, unusable, .. } = self;
         rows.retain(|row| {
             let fault = (0..2).filter(|&side| !fallen[side]).find_map(|side| Some((side, row.side_faults[side]?)));
             if let Some((side, reason)) = fault {
                 let camera = Camera::ALL[side + 1].name();
-                unusable.add(reason, || format!("{}:{}: {camera} image", file_name(&log), row.line));
+                unusable.add(reason, || format!("{log}:{}: {camera} image", row.line));
             }
             fault.is_none()
         });

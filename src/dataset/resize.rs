@@ -192,12 +192,7 @@ fn linear(
     let mut held = [usize::MAX; 2];
     let horizontal = |row: usize, out: &mut [i32]| {
         let row = &src[row * src_row..][..src_row];
-        for (tap, out) in x.iter().zip(out.chunks_exact_mut(c)) {
-            let (low, high) = (&row[tap.low * c..][..c], &row[tap.high * c..][..c]);
-            for ((out, &low), &high) in out.iter_mut().zip(low).zip(high) {
-                *out = i32::from(low) * tap.weights[0] + i32::from(high) * tap.weights[1];
-            }
-        }
+        if c == 1 { blend_row::<1>(row, x, out) } else { blend_row::<3>(row, x, out) }
     };
     for (tap, out) in y.iter().zip(dst.chunks_exact_mut(dst_row)) {
         if held[1] == tap.low {
@@ -214,6 +209,16 @@ fn linear(
         for ((out, &a), &b) in out.iter_mut().zip(&rows[0]).zip(&rows[1]) {
             *out = ((((low * (a >> 4)) >> 16) + ((high * (b >> 4)) >> 16) + 2) >> 2) as u8;
         }
+    }
+}
+
+/// One source row between its pixels, as [`ONE`] times the grey level.
+#[inline(always)]
+fn blend_row<const C: usize>(row: &[u8], x: &[LinearTap], out: &mut [i32]) {
+    let pixels = row.as_chunks::<C>().0;
+    for (tap, out) in x.iter().zip(out.as_chunks_mut::<C>().0) {
+        let (low, high) = (&pixels[tap.low], &pixels[tap.high]);
+        *out = std::array::from_fn(|i| i32::from(low[i]) * tap.weights[0] + i32::from(high[i]) * tap.weights[1]);
     }
 }
 

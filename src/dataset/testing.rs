@@ -1,5 +1,7 @@
-//! Helpers of the tests of this module.
+//! What the tests of this module share.
 
+use super::files::Files;
+use super::recording::{Camera, Kind, Recording, Row, Unusable};
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -29,4 +31,33 @@ pub(crate) fn recordings_folder() -> Option<PathBuf> {
         eprintln!("skipped: STEERSMAN_RECORDINGS does not name a folder of recordings");
     }
     folder
+}
+
+/// A recording without files: one session, a row every `step_ms`, all three cameras.
+pub(crate) fn recording_of(steering: &[f32], step_ms: i64) -> Recording {
+    let mut files = Files::default();
+    let images = Camera::ALL.map(|camera| Some((Path::new("IMG"), camera.name())));
+    let images = files.add(images).expect("three short names fit");
+    let rows = steering.iter().enumerate().map(|(i, &steering)| Row {
+        steering,
+        throttle: 1.0,
+        brake: 0.0,
+        speed_mph: 20.0,
+        time_ms: i as i64 * step_ms,
+        line: i as u32 + 1,
+        source: 0,
+        images,
+        side_faults: [None; 2],
+    });
+    Recording {
+        path: "memory".into(),
+        kind: Kind::Udacity,
+        rows: rows.collect(),
+        sessions: std::iter::once(0..steering.len()).filter(|session| !session.is_empty()).collect(),
+        unusable: Unusable::default(),
+        notices: Vec::new(),
+        image_size: None,
+        times_plausible: true,
+        files,
+    }
 }
