@@ -6,8 +6,10 @@
 //! phases are computed side by side in scratch and woven into `dx`.
 
 use super::direct::{TapSum, tile_height};
+use super::prepare::put_every;
 use super::{ConvShape, FORWARD_COPIES, MOST_LANES, grid, group_of};
 use crate::Isa;
+use crate::simd::Simd;
 
 /// The rows, or columns, of the input that leave one remainder.
 #[derive(Clone, Copy, Debug)]
@@ -125,26 +127,16 @@ impl InputGradient {
 
     /// Writes the rows and columns of one part into the images `dx`.
     #[inline(always)]
-    fn weave(&self, part: &Part, phase: &[f32], dx: &mut [f32]) {
+    fn weave<S: Simd>(&self, simd: S, part: &Part, phase: &[f32], dx: &mut [f32]) {
         let ConvShape { h, w, stride_h, stride_w, pad_top, pad_left, .. } = self.shape;
         let (rows, columns) = (part.rows, part.columns);
         let left = columns.first * stride_w + columns.remainder - pad_left;
         for (phase, dx) in phase.chunks_exact(part.sum.plane).zip(dx.chunks_exact_mut(h * w)) {
             for (q, from) in phase.chunks_exact(columns.count).enumerate() {
                 let iy = (rows.first + q) * stride_h + rows.remainder - pad_top;
-                put_every(from, stride_w, &mut dx[iy * w + left..(iy + 1) * w]);
+                put_every(simd, from, stride_w, &mut dx[iy * w + left..(iy + 1) * w]);
             }
         }
-    }
-}
-
-/// `to[i * stride] = from[i]`; constant strides vectorise.
-#[inline(always)]
-fn put_every(from: &[f32], stride: usize, to: &mut [f32]) {
-    let to = &mut to[..(from.len() - 1) * stride + 1];
-    match stride {
-        2 => from.iter().enumerate().for_each(|(i, &from)| to[i * 2] = from),
-        _ => from.iter().enumerate().for_each(|(i, &from)| to[i * stride] = from),
     }
 }
 
@@ -192,7 +184,7 @@ per_isa! {
                 } else {
                     let phase = &mut phase[..images * c * part.sum.plane];
                     part.sum.run(simd, padded, packed, phase);
-                    gradient.weave(part, phase, dx);
+                    gradient.weave(simd, part, phase, dx);
                 }
             }
         }
