@@ -17,7 +17,7 @@ fn expm1_of_negative(x: f32) -> f32 {
     /// Adding 1.5 * 2^23 leaves the nearest integer in the low bits of the sum.
     const ROUND: f32 = 12_582_912.0;
     /// The leading bits of ln 2: its product with a small integer is exact.
-    const LN2_HIGH: f32 = 0.693_359_375;
+    const LN2_HIGH: f32 = 0.693_359_4;
     const LN2_LOW: f32 = -2.121_944_4e-4;
     // Below -50, e^x - 1 is -1 in f32, and 2^k would leave the range of the exponent.
     let x = if x > -50.0 { x } else { -50.0 };

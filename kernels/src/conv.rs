@@ -3,7 +3,7 @@
 //! | pass | algorithm |
 //! |---|---|
 //! | forward | a sum over taps with vectors along the output rows ([`direct`]), of the image itself when the stride is 1 and nothing is padded, else of a copy that is padded and split into phases ([`prepare`]) |
-//! | input gradient | for each phase of the input the same sum over the zero-padded output gradient, with the kernel turned round ([`input_gradient`]) |
+//! | input gradient | for each phase of the input the same sum over the zero-padded output gradient, with the kernel turned round ([`input_gradient`]); where that would mostly multiply zeros, a matrix product and [`crate::im2col::col2im`] |
 //! | weight gradient | vectors along the output rows, summed over lanes at the end ([`weight_gradient`]) |
 
 mod direct;
@@ -175,7 +175,7 @@ per_isa! {
         let groups = x.chunks(group * conv.shape.x_len().max(1)).zip(y.chunks_mut(group * conv.shape.y_len()));
         for (x, y) in groups {
             let used = y.len() / conv.shape.y_len() * conv.layout.image();
-            conv.layout.copy(x, &mut copy[..used]);
+            conv.layout.copy(simd, x, &mut copy[..used]);
             copy[used..used + MOST_LANES].fill(0.0);
             sum.run(simd, &copy[..used + MOST_LANES], packed, y);
         }
@@ -200,7 +200,7 @@ per_isa! {
         let groups = x.chunks(group * conv.shape.x_len().max(1)).zip(dy.chunks(group * conv.shape.y_len()));
         for (x, dy) in groups {
             let used = dy.len() / conv.shape.y_len() * conv.layout.image();
-            conv.layout.copy(x, &mut copy[..used]);
+            conv.layout.copy(simd, x, &mut copy[..used]);
             copy[used..used + MOST_LANES].fill(0.0);
             weight_gradient::run(simd, &conv.sum, &copy[..used + MOST_LANES], dy, dweight, dbias, scratch);
         }

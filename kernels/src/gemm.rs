@@ -1,4 +1,14 @@
-//! Matrix product, packed into panels and cut into blocks for the caches (Goto and van de Geijn 2008).
+//! Matrix product.
+//!
+//! | condition | algorithm |
+//! |---|---|
+//! | at most [`FEW_ROWS`] rows; rows of `A` and columns of `B` contiguous | dot products ([`dots`]): nothing is packed |
+//! | at most [`FEW_ROWS`] rows; rows of `B` contiguous | blocks, with `B` read where it is |
+//! | else | blocks that fit the caches, packed into panels (Goto and van de Geijn 2008) |
+//!
+//! Packing `B` costs about as much as multiplying it by 16 rows, so it does not pay for a few.
+
+mod dots;
 
 use crate::simd::{ALIGNMENT, Simd, align};
 
@@ -13,6 +23,9 @@ const TILE_VECTORS: usize = 3;
 /// The largest tile of any instruction set.
 const MOST_ROWS: usize = 8;
 const MOST_COLUMNS: usize = 16 * TILE_VECTORS;
+
+/// Up to as many rows of `A`, `B` is not packed.
+const FEW_ROWS: usize = 32;
 
 /// Elements of scratch that [`gemm`] needs for an `m x k` times `k x n` product, at most 640 KiB.
 pub fn gemm_scratch_len(m: usize, k: usize, n: usize) -> usize {
@@ -60,7 +73,9 @@ pub fn gemm(
     let apart = (row >= 1 || m == 1) && (column >= 1 || n == 1);
     assert!(apart && (row > (n - 1) * column || column > (m - 1) * row), "gemm: elements of C share a place");
     assert!(scratch.len() >= gemm_scratch_len(m, k, n), "gemm: scratch is too short");
-    if column == 1 || row != 1 {
+    if m <= FEW_ROWS && k > 0 && (a_strides.1 == 1 || k == 1) && (b_strides.0 == 1 || k == 1) {
+        dots::run(isa, (m, k, n), alpha, (a, a_strides.0), (b, b_strides.1), beta, (c, c_strides));
+    } else if column == 1 || row != 1 {
         blocks(isa, (m, k, n), alpha, (a, a_strides), (b, b_strides), beta, (c, c_strides), scratch);
     } else {
         // The rows of C' are contiguous: C' = B' A'.
@@ -101,6 +116,7 @@ fn blocks_of<S: Simd, const MR: usize>(
     scratch: &mut [f32],
 ) {
     let columns = S::LANES * TILE_VECTORS;
+    let packs = m > FEW_ROWS || b_strides.1 != 1;
     let (packed_b, packed_a) = align(scratch).split_at_mut(n.min(BLOCK_N).next_multiple_of(columns) * k.min(BLOCK_K));
     for first_n in (0..n).step_by(BLOCK_N) {
         let block_n = BLOCK_N.min(n - first_n);
@@ -109,19 +125,33 @@ fn blocks_of<S: Simd, const MR: usize>(
             let block_k = BLOCK_K.min(k - first_k);
             let beta = if first_k == 0 { beta } else { 1.0 };
             let from = (first_k * b_strides.0 + first_n * b_strides.1, b_strides.0, b_strides.1);
-            pack(b, from, block_k, block_n, columns, packed_b);
+            if packs {
+                pack(b, from, block_k, block_n, columns, packed_b);
+            }
             for first_m in (0..m).step_by(BLOCK_M) {
                 let block_m = BLOCK_M.min(m - first_m);
-                let from = (first_m * a_strides.0 + first_k * a_strides.1, a_strides.1, a_strides.0);
-                pack(a, from, block_k, block_m, MR, packed_a);
+                let from_a = (first_m * a_strides.0 + first_k * a_strides.1, a_strides.1, a_strides.0);
+                pack(a, from_a, block_k, block_m, MR, packed_a);
                 for j in (0..block_n).step_by(columns) {
                     for i in (0..block_m).step_by(MR) {
                         let panel_a = &packed_a[i * block_k..][..MR * block_k];
-                        let panel_b = &packed_b[j * block_k..][..columns * block_k];
-                        let tile = tile::<S, MR>(simd, panel_a, panel_b);
-                        let (rows, columns) = (MR.min(block_m - i), columns.min(block_n - j));
+                        let (rows, wide) = (MR.min(block_m - i), columns.min(block_n - j));
+                        // An empty block has no panel, and an unpacked one ends with its last element.
+                        let tile = if block_k == 0 {
+                            [[simd.splat(0.0); TILE_VECTORS]; MR]
+                        } else if packs {
+                            let panel_b = &packed_b[j * block_k..][..columns * block_k];
+                            tile::<S, MR, false>(simd, panel_a, panel_b, columns, columns)
+                        } else {
+                            let panel_b = &b[from.0 + j..][..(block_k - 1) * b_strides.0 + wide];
+                            if wide == columns {
+                                tile::<S, MR, false>(simd, panel_a, panel_b, b_strides.0, columns)
+                            } else {
+                                tile::<S, MR, true>(simd, panel_a, panel_b, b_strides.0, wide)
+                            }
+                        };
                         let at = (first_m + i) * c_strides.0 + (first_n + j) * c_strides.1;
-                        write(simd, &tile, alpha, beta, &mut c[at..], c_strides, rows, columns);
+                        write(simd, &tile, alpha, beta, &mut c[at..], c_strides, rows, wide);
                     }
                 }
             }
@@ -165,20 +195,38 @@ fn pack(
     }
 }
 
-/// The product of a panel of `A` and one of `B`.
+/// The product of a panel of `A` and the `wide` columns of `B` that begin at `b[0]`, with rows `step` apart.
 #[inline(always)]
-fn tile<S: Simd, const MR: usize>(simd: S, a: &[f32], b: &[f32]) -> [[S::V; TILE_VECTORS]; MR] {
+fn tile<S: Simd, const MR: usize, const MASKED: bool>(
+    simd: S,
+    a: &[f32],
+    b: &[f32],
+    step: usize,
+    wide: usize,
+) -> [[S::V; TILE_VECTORS]; MR] {
+    let (a, _) = a.as_chunks::<MR>();
+    assert!(a.is_empty() || (a.len() - 1) * step + wide <= b.len(), "gemm: a panel is too short");
+    assert!(MASKED || wide == S::LANES * TILE_VECTORS, "gemm: a tile is too narrow");
     let mut sums = [[simd.splat(0.0); TILE_VECTORS]; MR];
-    for (a, b) in a.as_chunks::<MR>().0.iter().zip(b.chunks_exact(S::LANES * TILE_VECTORS)) {
+    let mut row = b.as_ptr();
+    for a in a {
         let mut columns = [simd.splat(0.0); TILE_VECTORS];
         for v in 0..TILE_VECTORS {
-            // SAFETY: a step of the panel holds `TILE_VECTORS` vectors.
-            columns[v] = unsafe { simd.load(b.as_ptr().add(v * S::LANES)) };
+            // SAFETY: each row has `wide` columns within `b`, as asserted; a tile that is not masked has all of them.
+            columns[v] = unsafe {
+                let from = row.wrapping_add(v * S::LANES);
+                if MASKED {
+                    simd.load_first(from, wide.saturating_sub(v * S::LANES).min(S::LANES))
+                } else {
+                    simd.load(from)
+                }
+            };
         }
+        row = row.wrapping_add(step);
         for r in 0..MR {
-            let row = simd.splat(a[r]);
+            let weight = simd.splat(a[r]);
             for v in 0..TILE_VECTORS {
-                sums[r][v] = simd.mul_add(columns[v], row, sums[r][v]);
+                sums[r][v] = simd.mul_add(columns[v], weight, sums[r][v]);
             }
         }
     }

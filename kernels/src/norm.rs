@@ -5,25 +5,53 @@
 /// Values that are summed side by side, so that a sum vectorises and still has a fixed order.
 const WIDTH: usize = 16;
 
-/// Adds up two terms for each pair of elements, in `WIDTH` interleaved parts.
+/// Adds a block of values to `WIDTH` interleaved sums.
 #[inline(always)]
-fn sum_pairs(x: &[f32], dy: &[f32], terms: impl Fn(f32, f32) -> (f64, f64)) -> (f64, f64) {
-    let (mut first, mut second) = ([0.0f64; WIDTH], [0.0f64; WIDTH]);
-    let (x_blocks, x_rest) = x.as_chunks::<WIDTH>();
-    let (dy_blocks, dy_rest) = dy.as_chunks::<WIDTH>();
-    for (x, dy) in x_blocks.iter().zip(dy_blocks) {
+fn add_block(sums: &mut [f64; WIDTH], block: [f32; WIDTH]) {
+    for i in 0..WIDTH {
+        sums[i] += f64::from(block[i]);
+    }
+}
+
+/// The sum of a plane and the sum of its squares.
+#[inline(always)]
+fn plane_sums(x: &[f32]) -> (f64, f64) {
+    let (mut sum, mut squares) = ([0.0f64; WIDTH], [0.0f64; WIDTH]);
+    let (blocks, rest) = x.as_chunks::<WIDTH>();
+    let mut last = [0.0; WIDTH];
+    last[..rest.len()].copy_from_slice(rest);
+    for x in blocks.iter().chain([&last]) {
+        add_block(&mut sum, *x);
         for i in 0..WIDTH {
-            let (a, b) = terms(x[i], dy[i]);
-            first[i] += a;
-            second[i] += b;
+            squares[i] += f64::from(x[i]) * f64::from(x[i]);
         }
     }
-    for (i, (&x, &dy)) in x_rest.iter().zip(dy_rest).enumerate() {
-        let (a, b) = terms(x, dy);
-        first[i] += a;
-        second[i] += b;
+    (sum.iter().sum(), squares.iter().sum())
+}
+
+/// The sum of a plane of `dy` and the sum of its products with the normalised `x`.
+#[inline(always)]
+fn plane_backward_sums(x: &[f32], dy: &[f32], mean: f32, inv_std: f32) -> (f64, f64) {
+    #[inline(always)]
+    fn products(x: &[f32; WIDTH], dy: &[f32; WIDTH], mean: f32, inv_std: f32) -> [f32; WIDTH] {
+        let mut products = [0.0; WIDTH];
+        for i in 0..WIDTH {
+            products[i] = dy[i] * ((x[i] - mean) * inv_std);
+        }
+        products
     }
-    (first.iter().sum(), second.iter().sum())
+    let (mut sum, mut sum_of_products) = ([0.0f64; WIDTH], [0.0f64; WIDTH]);
+    let ((x_blocks, x_rest), (dy_blocks, dy_rest)) = (x.as_chunks::<WIDTH>(), dy.as_chunks::<WIDTH>());
+    for (x, dy) in x_blocks.iter().zip(dy_blocks) {
+        add_block(&mut sum, *dy);
+        add_block(&mut sum_of_products, products(x, dy, mean, inv_std));
+    }
+    let (mut x, mut dy) = ([0.0; WIDTH], [0.0; WIDTH]);
+    x[..x_rest.len()].copy_from_slice(x_rest);
+    dy[..dy_rest.len()].copy_from_slice(dy_rest);
+    add_block(&mut sum, dy);
+    add_block(&mut sum_of_products, products(&x, &dy, mean, inv_std));
+    (sum.iter().sum(), sum_of_products.iter().sum())
 }
 
 per_isa! {
@@ -35,7 +63,7 @@ per_isa! {
         for image in 0..n {
             for channel in 0..c {
                 let plane = &x[(image * c + channel) * hw..][..hw];
-                let (a, b) = sum_pairs(plane, plane, |x, _| (f64::from(x), f64::from(x) * f64::from(x)));
+                let (a, b) = plane_sums(plane);
                 sum[channel] += a;
                 squares[channel] += b;
             }
@@ -90,10 +118,7 @@ per_isa! {
         for image in 0..n {
             for channel in 0..c {
                 let at = (image * c + channel) * hw;
-                let (mean, inv_std) = (mean[channel], inv_std[channel]);
-                let (a, b) = sum_pairs(&x[at..at + hw], &dy[at..at + hw], |x, dy| {
-                    (f64::from(dy), f64::from(dy * ((x - mean) * inv_std)))
-                });
+                let (a, b) = plane_backward_sums(&x[at..at + hw], &dy[at..at + hw], mean[channel], inv_std[channel]);
                 sum[channel] += a;
                 products[channel] += b;
             }

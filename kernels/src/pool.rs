@@ -49,12 +49,12 @@ per_isa! {
         }
         for (x, y) in x.chunks_exact(h * w).zip(y.chunks_exact_mut(out_h * out_w)).take(n * c) {
             for (oy, y) in y.chunks_exact_mut(out_w).enumerate() {
-                let top = oy * stride_h * w;
                 y.fill(f32::NEG_INFINITY);
-                for ky in 0..kh {
-                    let row = &x[top + ky * w..][..w];
-                    for kx in 0..kw {
-                        max_into(y, &row[kx..], stride_w);
+                for row in x[oy * stride_h * w..].chunks_exact(w).take(kh) {
+                    match (kw, stride_w) {
+                        (2, 2) => max_of_blocks::<2>(y, row),
+                        (4, 4) => max_of_blocks::<4>(y, row),
+                        _ => max_of_windows(y, row, kw, stride_w),
                     }
                 }
             }
@@ -62,22 +62,25 @@ per_isa! {
     }
 }
 
-/// `y[i] = max(y[i], x[i * stride])`; constant strides vectorise.
+/// `y[i]` becomes the maximum of itself and block `i` of a row.
 #[inline(always)]
-fn max_into(y: &mut [f32], x: &[f32], stride: usize) {
-    #[inline(always)]
-    fn run(y: &mut [f32], x: &[f32], stride: usize) {
-        let x = &x[..(y.len() - 1) * stride + 1];
-        for (i, y) in y.iter_mut().enumerate() {
-            let value = x[i * stride];
-            *y = if value > *y { value } else { *y };
+fn max_of_blocks<const K: usize>(y: &mut [f32], row: &[f32]) {
+    for (y, block) in y.iter_mut().zip(row.as_chunks::<K>().0) {
+        let mut most = *y;
+        for &x in block {
+            most = if x > most { x } else { most };
         }
+        *y = most;
     }
-    match stride {
-        1 => run(y, x, 1),
-        2 => run(y, x, 2),
-        4 => run(y, x, 4),
-        _ => run(y, x, stride),
+}
+
+/// `y[i]` becomes the maximum of itself and the `kw` elements of a row from `i * stride` on.
+#[inline(always)]
+fn max_of_windows(y: &mut [f32], row: &[f32], kw: usize, stride: usize) {
+    for kx in 0..kw {
+        for (y, &x) in y.iter_mut().zip(row[kx..].iter().step_by(stride)) {
+            *y = if x > *y { x } else { *y };
+        }
     }
 }
 
@@ -104,16 +107,66 @@ per_isa! {
         for plane in 0..n * c {
             let x = &x[plane * h * w..][..h * w];
             let dx = &mut dx[plane * h * w..][..h * w];
-            for oy in 0..out_h {
-                for ox in 0..out_w {
-                    let out = (plane * out_h + oy) * out_w + ox;
-                    let corner = oy * stride_h * w + ox * stride_w;
-                    let first = (0..kh * kw).map(|k| corner + k / kw * w + k % kw).find(|&at| x[at] == y[out]);
-                    if let Some(at) = first {
-                        dx[at] += dy[out];
-                    }
+            let y = &y[plane * out_h * out_w..][..out_h * out_w];
+            let dy = &dy[plane * out_h * out_w..][..out_h * out_w];
+            for (oy, (y, dy)) in y.chunks_exact(out_w).zip(dy.chunks_exact(out_w)).enumerate() {
+                let rows = oy * stride_h * w..(oy * stride_h + kh) * w;
+                let (x, dx) = (&x[rows.clone()], &mut dx[rows]);
+                match (kw, stride_w) {
+                    (2, 2) if stride_h >= kh => max_back_blocks::<2>(w, x, y, dy, dx),
+                    (4, 4) if stride_h >= kh => max_back_blocks::<4>(w, x, y, dy, dx),
+                    _ => max_back_windows(w, kw, stride_w, x, y, dy, dx),
                 }
             }
+        }
+    }
+}
+
+/// The gradient of a row of windows that neither overlap nor leave gaps; `x` and `dx` are its input rows of width `w`.
+#[inline(always)]
+fn max_back_blocks<const K: usize>(w: usize, x: &[f32], y: &[f32], dy: &[f32], dx: &mut [f32]) {
+    /// Windows at a time: their state stays in registers or the first-level cache.
+    const STRIP: usize = 64;
+    for (strip, (y, dy)) in y.chunks(STRIP).zip(dy.chunks(STRIP)).enumerate() {
+        // What each window still looks for: its maximum, then NaN, which equals nothing.
+        let mut sought = [f32::NAN; STRIP];
+        sought[..y.len()].copy_from_slice(y);
+        let mut gradient = [0.0; STRIP];
+        gradient[..y.len()].copy_from_slice(dy);
+        for (x, dx) in x.chunks_exact(w).zip(dx.chunks_exact_mut(w)) {
+            let blocks = strip * STRIP * K..(strip * STRIP + y.len()) * K;
+            let (x, dx) = (x[blocks.clone()].as_chunks::<K>().0, dx[blocks].as_chunks_mut::<K>().0);
+            // Columns of the windows side by side: then each step is a plain loop, which vectorises.
+            let mut columns = [[0.0f32; STRIP]; K];
+            for (i, x) in x.iter().enumerate().take(STRIP) {
+                for j in 0..K {
+                    columns[j][i] = x[j];
+                }
+            }
+            for column in &mut columns {
+                for i in 0..STRIP {
+                    let found = column[i] == sought[i];
+                    column[i] = if found { gradient[i] } else { 0.0 };
+                    sought[i] = if found { f32::NAN } else { sought[i] };
+                }
+            }
+            for (i, dx) in dx.iter_mut().enumerate().take(STRIP) {
+                for j in 0..K {
+                    dx[j] = columns[j][i];
+                }
+            }
+        }
+    }
+}
+
+/// The gradient of a row of windows of any kind, added to `dx`.
+#[inline(always)]
+fn max_back_windows(w: usize, kw: usize, stride: usize, x: &[f32], y: &[f32], dy: &[f32], dx: &mut [f32]) {
+    let kh = x.len() / w;
+    for (ox, (&y, &dy)) in y.iter().zip(dy).enumerate() {
+        let mut window = (0..kh * kw).map(|k| k / kw * w + ox * stride + k % kw);
+        if let Some(at) = window.find(|&at| x[at] == y) {
+            dx[at] += dy;
         }
     }
 }

@@ -4,10 +4,17 @@
 //! output rows `q - j`: for each remainder `r` the gradient is a sum of stride 1 over the zero-padded output gradient.
 //! The same holds for columns. With stride 1 there is one remainder, and the sum is written to `dx` directly; else the
 //! phases are computed side by side in scratch and woven into `dx`.
+//!
+//! A map of few rows is mostly border, where this sum multiplies zeros. There each window's gradient is computed once,
+//! `dy' W`, as a matrix product, and the windows are added up where they overlap.
 
 use super::direct::{TapSum, tile_height};
+use super::prepare::put_every;
 use super::{ConvShape, FORWARD_COPIES, MOST_LANES, grid, group_of};
 use crate::Isa;
+use crate::gemm::{gemm, gemm_scratch_len};
+use crate::im2col::col2im;
+use crate::simd::Simd;
 
 /// The rows, or columns, of the input that leave one remainder.
 #[derive(Clone, Copy, Debug)]
@@ -39,6 +46,10 @@ struct Part {
     sum: TapSum,
 }
 
+/// The share of multiplications that the sum over taps may waste on zeros and idle lanes: beyond 1.6 times the work
+/// that counts, the matrix product won in the benches (hyper's fifth layer, pilotnet's last two).
+const MOST_WORK: f64 = 1.6;
+
 /// The tables of the input gradient of one shape.
 #[derive(Clone, Debug)]
 pub(crate) struct InputGradient {
@@ -47,6 +58,8 @@ pub(crate) struct InputGradient {
     /// Rows and columns of zeros before the output gradient, and the sizes of a padded plane.
     before: (usize, usize),
     padded: (usize, usize),
+    /// Whether the matrix product is used instead.
+    by_product: bool,
 }
 
 impl InputGradient {
@@ -84,7 +97,9 @@ impl InputGradient {
                 parts.push(Part { rows, columns, sum });
             }
         }
-        InputGradient { shape, parts, before, padded }
+        let work: usize = parts.iter().map(|part| part.sum.spans.len() * isa.lanes() * part.sum.taps.len() * c).sum();
+        let by_product = work as f64 > MOST_WORK * shape.multiply_adds() as f64;
+        InputGradient { shape, parts, before, padded, by_product }
     }
 
     /// Elements of one padded output gradient.
@@ -105,6 +120,10 @@ impl InputGradient {
     }
 
     pub fn scratch_len(&self) -> usize {
+        if self.by_product {
+            let (pixels, taps) = (self.shape.out_pixels(), self.shape.taps());
+            return pixels * taps + gemm_scratch_len(pixels, self.shape.oc, taps);
+        }
         let group = group_of(self.image(), FORWARD_COPIES);
         let (packed, phase) = self.part_lens();
         group * (self.image() + phase) + MOST_LANES + packed
@@ -125,32 +144,37 @@ impl InputGradient {
 
     /// Writes the rows and columns of one part into the images `dx`.
     #[inline(always)]
-    fn weave(&self, part: &Part, phase: &[f32], dx: &mut [f32]) {
+    fn weave<S: Simd>(&self, simd: S, part: &Part, phase: &[f32], dx: &mut [f32]) {
         let ConvShape { h, w, stride_h, stride_w, pad_top, pad_left, .. } = self.shape;
         let (rows, columns) = (part.rows, part.columns);
         let left = columns.first * stride_w + columns.remainder - pad_left;
         for (phase, dx) in phase.chunks_exact(part.sum.plane).zip(dx.chunks_exact_mut(h * w)) {
             for (q, from) in phase.chunks_exact(columns.count).enumerate() {
                 let iy = (rows.first + q) * stride_h + rows.remainder - pad_top;
-                put_every(from, stride_w, &mut dx[iy * w + left..(iy + 1) * w]);
+                put_every(simd, from, stride_w, &mut dx[iy * w + left..(iy + 1) * w]);
             }
         }
     }
 }
 
-/// `to[i * stride] = from[i]`; constant strides vectorise.
-#[inline(always)]
-fn put_every(from: &[f32], stride: usize, to: &mut [f32]) {
-    let to = &mut to[..(from.len() - 1) * stride + 1];
-    match stride {
-        2 => from.iter().enumerate().for_each(|(i, &from)| to[i * 2] = from),
-        _ => from.iter().enumerate().for_each(|(i, &from)| to[i * stride] = from),
+/// The input gradient of the images in `dy`; `dx` is overwritten.
+pub(crate) fn run(isa: Isa, gradient: &InputGradient, dy: &[f32], weight: &[f32], dx: &mut [f32], scratch: &mut [f32]) {
+    if !gradient.by_product {
+        return by_taps(isa, gradient, dy, weight, dx, scratch);
+    }
+    let shape = &gradient.shape;
+    let (pixels, taps) = (shape.out_pixels(), shape.taps());
+    let (patches, scratch) = scratch.split_at_mut(pixels * taps);
+    dx.fill(0.0);
+    for (dy, dx) in dy.chunks_exact(shape.y_len()).zip(dx.chunks_exact_mut(shape.x_len())) {
+        let (m, k, n) = (pixels, shape.oc, taps);
+        gemm(isa, m, k, n, 1.0, dy, (1, pixels), weight, (taps, 1), 0.0, patches, (taps, 1), scratch);
+        col2im(shape, patches, dx);
     }
 }
 
 per_isa! {
-    /// The input gradient of the images in `dy`; `dx` is overwritten.
-    pub(crate) fn run<S>(
+    fn by_taps<S>(
         simd: S,
         gradient: &InputGradient,
         dy: &[f32],
@@ -192,7 +216,7 @@ per_isa! {
                 } else {
                     let phase = &mut phase[..images * c * part.sum.plane];
                     part.sum.run(simd, padded, packed, phase);
-                    gradient.weave(part, phase, dx);
+                    gradient.weave(simd, part, phase, dx);
                 }
             }
         }

@@ -1,6 +1,7 @@
 //! Images as the direct kernels read them: padded, and with strided columns brought side by side.
 
 use super::ConvShape;
+use crate::simd::Simd;
 
 /// How the planes of an input image are laid out for a stride-1 sum over taps.
 ///
@@ -58,7 +59,7 @@ impl Layout {
 
     /// Copies images `[c][h][w]` into this layout; `to` is overwritten.
     #[inline(always)]
-    pub fn copy(&self, x: &[f32], to: &mut [f32]) {
+    pub fn copy<S: Simd>(&self, simd: S, x: &[f32], to: &mut [f32]) {
         let ConvShape { c, h, w, stride_h, stride_w, pad_top, pad_left, .. } = self.shape;
         let plane = self.rows * self.pitch;
         if h * w == 0 || plane == 0 {
@@ -82,26 +83,45 @@ impl Layout {
                     let x = &x[(row - pad_top) * w..][..w];
                     to[..first].fill(0.0);
                     to[last..].fill(0.0);
-                    take_every(&x[first * stride_w + phase_x - pad_left..], stride_w, &mut to[first..last]);
+                    take_every(simd, &x[first * stride_w + phase_x - pad_left..], stride_w, &mut to[first..last]);
                 }
             }
         }
     }
 }
 
-/// `to[i] = x[i * stride]`; constant strides vectorise.
+/// `to[i] = x[i * stride]`.
 #[inline(always)]
-fn take_every(x: &[f32], stride: usize, to: &mut [f32]) {
-    #[inline(always)]
-    fn run(x: &[f32], stride: usize, to: &mut [f32]) {
-        let x = &x[..(to.len() - 1) * stride + 1];
-        for (i, to) in to.iter_mut().enumerate() {
-            *to = x[i * stride];
-        }
-    }
+fn take_every<S: Simd>(simd: S, x: &[f32], stride: usize, to: &mut [f32]) {
+    assert!((to.len() - 1) * stride < x.len(), "a row ends too early");
     match stride {
         1 => to.copy_from_slice(&x[..to.len()]),
-        2 => run(x, 2, to),
-        _ => run(x, stride, to),
+        2 => {
+            for (i, to) in to.chunks_mut(S::LANES).enumerate() {
+                // SAFETY: a chunk has 1 to `LANES` elements, and the last value of the last one lies in `x`.
+                unsafe {
+                    let values = simd.load_every_second(x.as_ptr().add(2 * S::LANES * i), to.len());
+                    simd.store_first(to.as_mut_ptr(), values, to.len());
+                }
+            }
+        }
+        _ => to.iter_mut().zip(x.iter().step_by(stride)).for_each(|(to, &x)| *to = x),
+    }
+}
+
+/// `to[i * stride] = from[i]`.
+#[inline(always)]
+pub(crate) fn put_every<S: Simd>(simd: S, from: &[f32], stride: usize, to: &mut [f32]) {
+    assert!((from.len() - 1) * stride < to.len(), "a row ends too early");
+    if stride == 2 {
+        for (i, from) in from.chunks(S::LANES).enumerate() {
+            // SAFETY: a chunk has 1 to `LANES` elements, and the last place of the last one lies in `to`.
+            unsafe {
+                let values = simd.load_first(from.as_ptr(), from.len());
+                simd.store_every_second(to.as_mut_ptr().add(2 * S::LANES * i), values, from.len());
+            }
+        }
+    } else {
+        to.iter_mut().step_by(stride).zip(from).for_each(|(to, &from)| *to = from);
     }
 }

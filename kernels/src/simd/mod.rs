@@ -97,4 +97,35 @@ pub(crate) trait Simd: Copy {
             rest &= rest - 1;
         }
     }
+
+    /// Reads every second of the first `2 count - 1` values into the first `count <= LANES` lanes, `count` at least 1;
+    /// what the other lanes hold is not said.
+    ///
+    /// # Safety
+    /// `p` must be valid for reading `2 count - 1` values.
+    #[inline(always)]
+    unsafe fn load_every_second(self, p: *const f32, count: usize) -> Self::V {
+        let mut lanes = [0.0; 16];
+        for (i, lane) in lanes.iter_mut().enumerate().take(count.min(Self::LANES)) {
+            // SAFETY: the last is value `2 count - 2`, for which the caller vouches.
+            *lane = unsafe { *p.add(2 * i) };
+        }
+        // SAFETY: `lanes` holds 16 values, and no vector is longer.
+        unsafe { self.load(lanes.as_ptr()) }
+    }
+
+    /// Writes the first `count <= LANES` lanes to every second of the first `2 count - 1` places.
+    ///
+    /// # Safety
+    /// `p` must be valid for writing `2 count - 1` values.
+    #[inline(always)]
+    unsafe fn store_every_second(self, p: *mut f32, v: Self::V, count: usize) {
+        let mut lanes = [0.0; 16];
+        // SAFETY: `lanes` holds 16 values, and no vector is longer.
+        unsafe { self.store(lanes.as_mut_ptr(), v) };
+        for (i, lane) in lanes.into_iter().enumerate().take(count.min(Self::LANES)) {
+            // SAFETY: the last is place `2 count - 2`, for which the caller vouches.
+            unsafe { *p.add(2 * i) = lane };
+        }
+    }
 }

@@ -76,6 +76,19 @@ impl Simd for Avx2 {
         // SAFETY: the token proves AVX2; the mask admits only the values for which the caller vouches.
         unsafe { _mm256_maskstore_ps(p, self.first(count), v) }
     }
+
+    #[inline(always)]
+    unsafe fn load_every_second(self, p: *const f32, count: usize) -> __m256 {
+        let values = 2 * count - 1;
+        // SAFETY: the token proves AVX2; the masks admit `2 count - 1` values, for which the caller vouches.
+        unsafe {
+            let low = self.load_first(p, values);
+            let high = self.load_first(p.wrapping_add(8), values.saturating_sub(8));
+            // Within each half: two values of `low`, two of `high`; then the halves of each are brought together.
+            let even = _mm256_castps_pd(_mm256_shuffle_ps::<0b10_00_10_00>(low, high));
+            _mm256_castpd_ps(_mm256_permute4x64_pd::<0b11_01_10_00>(even))
+        }
+    }
 }
 
 /// The token of AVX-512 F, BW, DQ and VL.
@@ -155,5 +168,30 @@ impl Simd for Avx512 {
         let (mask, count) = (mask as __mmask16, mask.count_ones() as usize);
         // SAFETY: the token proves AVX-512; `count` values are written, for which the caller vouches.
         unsafe { _mm512_mask_storeu_ps(p, self.first(count), _mm512_maskz_compress_ps(mask, v)) }
+    }
+
+    #[inline(always)]
+    unsafe fn load_every_second(self, p: *const f32, count: usize) -> __m512 {
+        let values = 2 * count - 1;
+        // SAFETY: the token proves AVX-512; the masks admit `2 count - 1` values, for which the caller vouches.
+        unsafe {
+            let low = self.load_first(p, values);
+            let high = self.load_first(p.wrapping_add(16), values.saturating_sub(16));
+            let even = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
+            _mm512_permutex2var_ps(low, even, high)
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn store_every_second(self, p: *mut f32, v: __m512, count: usize) {
+        let places = 0x5555_5555u32 & (u32::MAX >> (32 - 2 * count.clamp(1, 16)));
+        // SAFETY: the token proves AVX-512; the masks admit places 0, 2 .. 2 count - 2, for which the caller vouches.
+        unsafe {
+            let low = _mm512_setr_epi32(0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 5, 5, 6, 6, 7, 7);
+            let high = _mm512_setr_epi32(8, 8, 9, 9, 10, 10, 11, 11, 12, 12, 13, 13, 14, 14, 15, 15);
+            _mm512_mask_storeu_ps(p, places as __mmask16, _mm512_permutexvar_ps(low, v));
+            let rest = p.wrapping_add(16);
+            _mm512_mask_storeu_ps(rest, (places >> 16) as __mmask16, _mm512_permutexvar_ps(high, v));
+        }
     }
 }

@@ -2,6 +2,8 @@
 
 use super::{Failures, isas, nans, numbers};
 use steersman_kernels::conv::{Conv, ConvShape};
+use steersman_kernels::gemm::{gemm, gemm_scratch_len};
+use steersman_kernels::im2col::{col2im, im2col};
 use steersman_kernels::reference;
 
 /// Sizes c, h, w, oc; kernel; stride; padding top, bottom, left, right.
@@ -106,4 +108,34 @@ fn the_result_of_an_image_does_not_depend_on_the_batch() {
             }
         }
     }
+}
+
+#[test]
+fn patches_and_products_make_the_same_convolution() {
+    let mut failures = Failures::default();
+    for case in CASES {
+        let shape = shape(case);
+        let (taps, pixels) = (shape.c * shape.kh * shape.kw, shape.out_h() * shape.out_w());
+        let (x, dy) = (numbers(3, shape.c * shape.h * shape.w), numbers(4, shape.oc * pixels));
+        let weight = numbers(1, shape.oc * taps);
+        let (mut y, mut dx) = (nans(shape.oc * pixels), nans(x.len()));
+        reference::conv_forward(&shape, 1, &x, &weight, &vec![0.0; shape.oc], &mut y);
+        reference::conv_backward_input(&shape, 1, &dy, &weight, &mut dx);
+        for isa in isas() {
+            let mut patches = nans(pixels * taps);
+            im2col(&shape, &x, &mut patches);
+            let (m, k, n) = (shape.oc, taps, pixels);
+            let (mut actual, scratch) = (nans(m * n), &mut nans(gemm_scratch_len(m, k, n)));
+            gemm(isa, m, k, n, 1.0, &weight, (k, 1), &patches, (1, k), 0.0, &mut actual, (n, 1), scratch);
+            failures.compare(&format!("im2col {} {shape:?}", isa.name()), &actual, &y, 1e-5);
+
+            let (m, k, n) = (pixels, shape.oc, taps);
+            let scratch = &mut nans(gemm_scratch_len(m, k, n));
+            gemm(isa, m, k, n, 1.0, &dy, (1, m), &weight, (n, 1), 0.0, &mut patches, (n, 1), scratch);
+            let mut actual = vec![0.0; x.len()];
+            col2im(&shape, &patches, &mut actual);
+            failures.compare(&format!("col2im {} {shape:?}", isa.name()), &actual, &dx, 1e-5);
+        }
+    }
+    failures.report();
 }

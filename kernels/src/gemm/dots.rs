@@ -1,0 +1,98 @@
+//! Products of few rows with a transposed matrix: dot products of contiguous rows.
+
+use crate::simd::Simd;
+
+/// Columns of `C` in a tile.
+const TILE_COLUMNS: usize = 3;
+/// Elements of the rows that a tile goes through before the next: 8 rows of them take half of a 32 KiB cache.
+const BLOCK_K: usize = 512;
+
+per_isa! {
+    /// `C = alpha A B + beta C`, where rows of `A` and columns of `B` are contiguous and `k > 0`; `a` and `b` come with
+    /// the distance between them. The caller has checked the lengths; an error here can only panic.
+    pub(super) fn run<S>(
+        simd: S,
+        sizes: (usize, usize, usize),
+        alpha: f32,
+        a: (&[f32], usize),
+        b: (&[f32], usize),
+        beta: f32,
+        c: (&mut [f32], (usize, usize)),
+    ) {
+        if S::MANY_REGISTERS {
+            run_rows::<S, 8>(simd, sizes, alpha, a, b, beta, c);
+        } else {
+            run_rows::<S, 4>(simd, sizes, alpha, a, b, beta, c);
+        }
+    }
+}
+
+#[inline(always)]
+fn run_rows<S: Simd, const MR: usize>(
+    simd: S,
+    (m, k, n): (usize, usize, usize),
+    alpha: f32,
+    (a, a_stride): (&[f32], usize),
+    (b, b_stride): (&[f32], usize),
+    beta: f32,
+    (c, c_strides): (&mut [f32], (usize, usize)),
+) {
+    for first_k in (0..k).step_by(BLOCK_K) {
+        let depth = BLOCK_K.min(k - first_k);
+        let beta = if first_k == 0 { beta } else { 1.0 };
+        for i in (0..m).step_by(MR) {
+            for j in (0..n).step_by(TILE_COLUMNS) {
+                // A tile that hangs over the edge repeats the last row or column and drops what comes of it.
+                let mut rows = [a; MR];
+                for (r, row) in rows.iter_mut().enumerate() {
+                    *row = &a[(i + r).min(m - 1) * a_stride + first_k..][..depth];
+                }
+                let mut columns = [b; TILE_COLUMNS];
+                for (t, column) in columns.iter_mut().enumerate() {
+                    *column = &b[(j + t).min(n - 1) * b_stride + first_k..][..depth];
+                }
+                let sums = tile(simd, depth, rows, columns);
+                for (r, sums) in sums.iter().enumerate().take(m - i) {
+                    for (t, &sum) in sums.iter().enumerate().take(n - j) {
+                        let c = &mut c[(i + r) * c_strides.0 + (j + t) * c_strides.1];
+                        let value = alpha * simd.sum(sum);
+                        *c = if beta == 0.0 { value } else { beta * *c + value };
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// The products of `MR` rows and `TILE_COLUMNS` columns of `depth` elements, still spread over the lanes.
+#[inline(always)]
+fn tile<S: Simd, const MR: usize>(
+    simd: S,
+    depth: usize,
+    rows: [&[f32]; MR],
+    columns: [&[f32]; TILE_COLUMNS],
+) -> [[S::V; TILE_COLUMNS]; MR] {
+    assert!(rows.iter().chain(&columns).all(|line| line.len() == depth), "gemm: a row is too short");
+    let mut sums = [[simd.splat(0.0); TILE_COLUMNS]; MR];
+    for at in (0..depth).step_by(S::LANES) {
+        let count = S::LANES.min(depth - at);
+        // SAFETY: `at + count <= depth`, the length of every row and column; whole vectors are read if there is one.
+        unsafe {
+            let load = |line: &[f32]| {
+                let from = line.as_ptr().add(at);
+                if count == S::LANES { simd.load(from) } else { simd.load_first(from, count) }
+            };
+            let mut of_columns = [simd.splat(0.0); TILE_COLUMNS];
+            for t in 0..TILE_COLUMNS {
+                of_columns[t] = load(columns[t]);
+            }
+            for r in 0..MR {
+                let row = load(rows[r]);
+                for t in 0..TILE_COLUMNS {
+                    sums[r][t] = simd.mul_add(row, of_columns[t], sums[r][t]);
+                }
+            }
+        }
+    }
+    sums
+}
