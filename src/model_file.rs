@@ -31,7 +31,7 @@ pub struct Model {
     pub parameters: Parameters,
     /// How training went.
     pub record: TrainingRecord,
-    /// [`row_id`](crate::dataset::row_id)s of the rows it was trained on, sorted.
+    /// [`row_id`](crate::dataset::Recording::row_id)s of the rows it was trained on, sorted.
     pub training_rows: Vec<u64>,
 }
 

@@ -12,7 +12,10 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 use steersman_kernels::Isa;
 
-use crate::dataset::{Augmentation, Balance, Preprocessing, SampleSpec, SplitSpec};
+use crate::dataset::augment::Augmentation;
+use crate::dataset::preprocess::Preprocessing;
+use crate::dataset::split::SplitSpec;
+use crate::dataset::{Balance, SampleSpec};
 use crate::error::{Error, Result};
 use crate::network::{LayerSpec, Network};
 use crate::optimizer::{OptimizerSpec, ScheduleSpec};

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use steersman_kernels::Isa;
 
 use super::{or_dash, pool, print_json};
-use crate::dataset::{self, Camera, Recording, row_id};
+use crate::dataset::{self, Camera, Recording};
 use crate::error::{Error, Result};
 use crate::model_file::Model;
 use crate::pilot::Pilot;
@@ -44,7 +44,7 @@ pub fn run(args: EvaluateArgs) -> Result<()> {
         for notice in &recording.notices {
             eprintln!("{}: {notice}", path.display());
         }
-        known += (0..recording.rows.len()).filter(|row| trained_on.contains(&row_id(&recording, *row))).count();
+        known += (0..recording.rows.len()).filter(|row| trained_on.contains(&recording.row_id(*row))).count();
         predictions.extend(pool(args.threads)?.install(|| predict(&pilot, &recording, sessions_before)));
         sessions_before += recording.sessions.len();
     }

@@ -3,6 +3,7 @@
 use super::files::{Files, Name};
 use crate::{Error, Result};
 use serde::Serialize;
+use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
@@ -179,6 +180,21 @@ impl Recording {
     pub fn image_path(&self, row: usize, camera: Camera) -> Option<PathBuf> {
         let name = self.rows.get(row)?.images[camera as usize]?;
         Some(self.files.path(name))
+    }
+
+    /// A number that stands for `row` wherever the recording lies: from the name of its centre image and its steering. Model
+    /// files keep those of their training rows.
+    ///
+    /// # Panics
+    /// If there is no such row.
+    pub fn row_id(&self, row: usize) -> u64 {
+        let path = self.image_path(row, Camera::Centre);
+        let name = path.as_ref().and_then(|path| path.file_name()).unwrap_or_default();
+        let mut hash = Sha256::new();
+        hash.update(name.as_encoded_bytes());
+        hash.update(self.rows[row].steering.to_le_bytes());
+        let digest: [u8; 32] = hash.finalize().into();
+        u64::from_le_bytes(std::array::from_fn(|i| digest[i]))
     }
 
     /// Whether `row` has an image of `camera`.

@@ -12,6 +12,7 @@
 //! | `result.json` | what `train --json` prints; its presence says that the run is finished |
 
 mod checkpoint;
+mod data;
 mod history;
 mod loss;
 mod run_folder;
@@ -19,6 +20,7 @@ mod session;
 mod validation;
 
 pub use checkpoint::{Progress, State};
+pub use data::Data;
 pub use history::{EpochRecord, write_history};
 pub use loss::Loss;
 pub use run_folder::RunFolder;

@@ -11,12 +11,16 @@ use super::checkpoint::{Progress, State};
 use super::history::{EpochRecord, write_history};
 use super::run_folder::{RunFolder, RunInfo};
 use super::validation::{Validation, ValidationResult};
-use crate::dataset::{Batch, Data, LeakAudit, Loader};
+use super::data::Data;
+use crate::dataset::loader::{Batch, Loader};
 use crate::error::{Error, Result};
 use crate::model_file::{Model, TrainingRecord, weights_hash};
 use crate::network::{Network, StepInput, TrainingPlan};
 use crate::optimizer::Optimizer;
 use crate::recipe::Recipe;
+
+/// Most images of one row: three cameras, each mirrored. A batch of whole rows has at least one row.
+const IMAGES_OF_A_ROW: usize = 6;
 
 /// What to train on, and how.
 #[derive(Clone, Debug)]
@@ -145,7 +149,7 @@ struct Session {
     training: Loader,
     training_rows: Vec<u64>,
     validation: Option<Validation>,
-    leak: LeakAudit,
+    leak_percent: f64,
     notices: Vec<String>,
     state: State,
     started: Instant,
@@ -156,11 +160,13 @@ impl Session {
         let network = recipe.network(Isa::best())?;
         let optimizer = Optimizer::new(recipe.optimizer, recipe.clip_gradient_norm, &network);
         let parameters = network.initialize(info.seed);
-        let (leak, notices, training_rows) = (data.leak_audit(), data.notices(), data.training_row_ids());
+        let (leak_percent, training_rows) = (data.leak_percent(), data.training_row_ids());
+        let notices = data.notices().to_vec();
         let (training, validation) = data.into_loaders()?;
+        let capacity = recipe.batch.max(IMAGES_OF_A_ROW);
         Ok(Session {
-            plan: TrainingPlan::new(&network, recipe.batch),
-            validation: validation.map(|loader| Validation::new(loader, &network, recipe.full_lock_deg)),
+            plan: TrainingPlan::new(&network, capacity),
+            validation: validation.map(|loader| Validation::new(loader, &network, capacity, recipe.full_lock_deg)),
             state: State { parameters, optimizer, best: None, progress: Progress::default() },
             folder,
             info,
@@ -168,7 +174,7 @@ impl Session {
             network,
             training,
             training_rows,
-            leak,
+            leak_percent,
             notices,
             started,
         })
@@ -188,20 +194,25 @@ impl Session {
             observer.notice(notice);
         }
         let seconds_before = self.state.progress.seconds;
+        let mut nothing_decoded = true;
         let mut batches = [Batch::default(), Batch::default()];
         while self.state.progress.epoch < self.recipe.epochs && !self.stop_early() {
             let epoch_started = Instant::now();
+            // In the first epoch of this process every image is decoded.
+            let first_here = std::mem::take(&mut nothing_decoded);
             let learning_rate = self.train_epoch(&mut batches, observer, stop, seconds_before)?;
             let validation = match &mut self.validation {
                 Some(validation) => validation.run(&self.network, &self.state.parameters)?,
                 None => None,
             };
             self.end_epoch(learning_rate, validation, epoch_started, observer);
+            if first_here {
+                self.report_images(observer);
+            }
             self.state.progress.seconds = seconds_before + self.started.elapsed().as_secs_f64();
             write_history(&self.folder.file("history.csv"), &self.state.progress.history)?;
             self.save_checkpoint()?;
         }
-        self.report_damaged(observer);
         self.finish()
     }
 
@@ -259,7 +270,7 @@ impl Session {
             progress.images += current.n;
             progress.next_batch = following;
             progress.train_seconds = seconds_of_epoch_before + started.elapsed().as_secs_f64();
-            observer.progress(epoch + 1, progress.images, training.images());
+            observer.progress(epoch + 1, progress.images, training.samples());
             std::mem::swap(current, next);
             if stop.load(Ordering::Relaxed) {
                 self.state.progress.seconds = seconds_before + self.started.elapsed().as_secs_f64();
@@ -357,16 +368,20 @@ impl Session {
                 train_loss: record.train_loss,
                 val_mse: record.val_mse,
                 val_center_mse: record.val_center_mse,
-                leak_percent: self.leak.within_a_second_percent,
+                leak_percent: self.leak_percent,
             },
             training_rows: self.training_rows.clone(),
         }
     }
 
-    fn report_damaged(&self, observer: &mut dyn Observer) {
-        let damaged = self.training.damaged().into_iter().chain(self.validation.iter().flat_map(|v| v.damaged()));
-        for image in damaged {
-            observer.notice(&format!("left out, it cannot be decoded: {image}"));
+    /// What is only known once every image has been decoded.
+    fn report_images(&self, observer: &mut dyn Observer) {
+        let sides = [Some(self.training.undecodable()), self.validation.as_ref().map(Validation::undecodable)];
+        for (count, examples) in sides.into_iter().flatten().filter(|(count, _)| *count > 0) {
+            observer.notice(&format!("{count} images cannot be decoded and are left out: {}", examples.join("; ")));
+        }
+        if let Some(validation) = &self.validation {
+            observer.notice(&validation.near_twins(&self.training).summary());
         }
     }
 
@@ -391,12 +406,12 @@ impl Session {
             val_center_mse: best.val_center_mse,
             val_mae_deg: best.val_mae_deg,
             relative_to_zero: best.relative_to_zero,
-            train_images: self.training.images(),
+            train_images: self.training.samples(),
             val_images: self.validation.as_ref().map_or(0, Validation::images),
             seconds: progress.seconds,
             images_per_second: images as f64 / seconds,
             weights_hash: weights_hash(&self.network, &self.state.parameters),
-            leak_percent: self.leak.within_a_second_percent,
+            leak_percent: self.leak_percent,
         };
         self.save_checkpoint()?;
         self.folder.write_json("result.json", &result)?;

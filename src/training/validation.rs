@@ -1,6 +1,8 @@
 //! The held-out side, after each epoch.
 
-use crate::dataset::{Batch, Camera, Loader};
+use crate::dataset::Camera;
+use crate::dataset::leak::NearTwins;
+use crate::dataset::loader::{Batch, Loader};
 use crate::error::Result;
 use crate::network::{InferencePlan, Network, Parameters};
 
@@ -28,9 +30,8 @@ pub struct Validation {
 }
 
 impl Validation {
-    /// Validates on the images of `loader`.
-    pub fn new(loader: Loader, network: &Network, full_lock_deg: f64) -> Validation {
-        let capacity = loader.batch_size();
+    /// Validates on the images of `loader`, whose batches have at most `capacity`.
+    pub fn new(loader: Loader, network: &Network, capacity: usize, full_lock_deg: f64) -> Validation {
         Validation {
             plan: InferencePlan::new(network, capacity),
             batches: [Batch::default(), Batch::default()],
@@ -40,14 +41,19 @@ impl Validation {
         }
     }
 
-    /// Number of images.
+    /// Number of images, each mirrored one counted too.
     pub fn images(&self) -> usize {
-        self.loader.images()
+        self.loader.samples()
     }
 
-    /// Images that turned out to be damaged.
-    pub fn damaged(&self) -> Vec<String> {
-        self.loader.damaged()
+    /// Images that could not be decoded so far: their number, and the first few with their paths.
+    pub fn undecodable(&self) -> (usize, Vec<String>) {
+        self.loader.undecodable()
+    }
+
+    /// How many validation frames look almost like one of `training`, among those decoded so far.
+    pub fn near_twins(&self, training: &Loader) -> NearTwins {
+        self.loader.near_twins(training)
     }
 
     /// Runs the network over the whole side. `None` if no image can be read.

@@ -1,0 +1,132 @@
+//! What a run trains and validates on: recordings, split and loaders.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use sha2::{Digest, Sha256};
+
+use crate::atomic_file;
+use crate::dataset::cache::{CacheSpec, Overflow};
+use crate::dataset::leak::LeakAudit;
+use crate::dataset::loader::{Loader, LoaderSpec};
+use crate::dataset::split::{Split, split};
+use crate::dataset::{self, Item, Recording};
+use crate::error::{Error, Result};
+use crate::recipe::Recipe;
+
+/// Recordings that have been read and split.
+#[derive(Debug)]
+pub struct Data {
+    recordings: Arc<[Recording]>,
+    split: Split,
+    loader: LoaderSpec,
+    notices: Vec<String>,
+}
+
+impl Data {
+    /// Reads the recordings and splits them as `recipe` says.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Io`] and [`Error::Data`] for recordings that cannot be used, [`Error::Usage`] if a side would be empty.
+    pub fn prepare(paths: &[PathBuf], recipe: &Recipe, seed: u64, cache_mib: usize) -> Result<Data> {
+        let mut recordings = Vec::new();
+        let mut notices = Vec::new();
+        for path in paths {
+            let recording = dataset::load(path)?;
+            recording.require_usable()?;
+            let mut notice = |text: &str| notices.push(format!("{}: {text}", path.display()));
+            for text in &recording.notices {
+                notice(text);
+            }
+            let unusable = recording.unusable.rows();
+            if unusable > 0 {
+                notice(&format!("{unusable} of {} rows cannot be used and are left out", recording.total_rows()));
+            }
+            if let Some(text) = recording.image_size.and_then(|size| recipe.preprocessing.size_notice(size)) {
+                notice(&text);
+            }
+            recordings.push(recording);
+        }
+        let split = split(&recordings, &recipe.split, &recipe.samples, &recipe.balance, seed)?;
+        notices.push(split.summary());
+        notices.push(LeakAudit::of(&split, &recordings).summary());
+        let loader = LoaderSpec {
+            preprocessing: recipe.preprocessing.clone(),
+            samples: recipe.samples.clone(),
+            augmentation: recipe.augmentation.clone(),
+            batch: recipe.batch,
+            seed,
+            cache: CacheSpec { memory_bytes: cache_mib << 20, overflow: Overflow::File, folder: None },
+        };
+        Ok(Data { recordings: recordings.into(), split, loader, notices })
+    }
+
+    /// What the user should know of the recordings and the split.
+    pub fn notices(&self) -> &[String] {
+        &self.notices
+    }
+
+    /// Share of validation rows with a training row of the same session within a second, in percent.
+    pub fn leak_percent(&self) -> f64 {
+        100.0 * LeakAudit::of(&self.split, &self.recordings).share()
+    }
+
+    /// [`Recording::row_id`] of each training row, sorted.
+    pub fn training_row_ids(&self) -> Vec<u64> {
+        let mut ids: Vec<u64> = self.split.training.iter().map(|item| self.row_id(item)).collect();
+        ids.sort_unstable();
+        ids.dedup();
+        ids
+    }
+
+    /// A hash over the rows of both sides, in hexadecimal digits.
+    pub fn rows_hash(&self) -> String {
+        let mut hash = Sha256::new();
+        for side in [&self.split.training, &self.split.validation] {
+            hash.update((side.len() as u64).to_le_bytes());
+            for item in side {
+                hash.update(self.row_id(item).to_le_bytes());
+                item.cameras().for_each(|camera| hash.update([camera as u8]));
+            }
+        }
+        hash.finalize().iter().take(16).map(|byte| format!("{byte:02x}")).collect()
+    }
+
+    /// Writes `split.csv`: recording, line of its log, side, cameras, steering.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Io`].
+    pub fn write_split(&self, path: &Path) -> Result<()> {
+        let failed = |e: csv::Error| Error::data(path, e.to_string());
+        let mut writer = csv::Writer::from_writer(Vec::new());
+        writer.write_record(["recording", "line", "side", "cameras", "steering"]).map_err(failed)?;
+        for (side, items) in [("training", &self.split.training), ("validation", &self.split.validation)] {
+            for item in items {
+                let recording = &self.recordings[usize::from(item.recording)];
+                let row = &recording.rows[item.row as usize];
+                let cameras: Vec<_> = item.cameras().map(|camera| camera.name()).collect();
+                let (path, line) = (recording.path.display().to_string(), row.line.to_string());
+                let (cameras, steering) = (cameras.join(" "), row.steering.to_string());
+                writer.write_record([path.as_str(), &line, side, &cameras, &steering]).map_err(failed)?;
+            }
+        }
+        let bytes = writer.into_inner().map_err(|e| Error::data(path, e.to_string()))?;
+        atomic_file::write(path, &bytes)
+    }
+
+    /// The loaders of both sides; no validation loader if nothing is held out.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Io`] if the cache file cannot be created.
+    pub fn into_loaders(self) -> Result<(Loader, Option<Loader>)> {
+        let (training, validation) = Loader::pair(&self.recordings, &self.split, &self.loader)?;
+        Ok((training, (validation.images() > 0).then_some(validation)))
+    }
+
+    fn row_id(&self, item: &Item) -> u64 {
+        self.recordings[usize::from(item.recording)].row_id(item.row as usize)
+    }
+}
