@@ -167,7 +167,7 @@ per_isa! {
     ) {
         let (copy, packed) = scratch.split_at_mut(conv.copy_len(FORWARD_COPIES));
         let sum = &conv.sum;
-        sum.pack(direct::tile_height(S::MANY_REGISTERS, sum.channels), Some(bias), weight, packed);
+        sum.pack(simd, Some(bias), weight, packed);
         if !conv.layout.copies {
             return sum.run(simd, x, packed, y);
         }
