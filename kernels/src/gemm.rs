@@ -2,8 +2,8 @@
 //!
 //! | condition | algorithm |
 //! |---|---|
-//! | at most [`FEW_ROWS`] rows; rows of `A` and columns of `B` contiguous | dot products ([`dots`]): nothing is packed |
-//! | at most [`FEW_ROWS`] rows; rows of `B` contiguous | blocks, with `B` read where it is |
+//! | at most 32 rows; rows of `A` and columns of `B` contiguous | dot products (`dots`): nothing is packed |
+//! | at most 32 rows; rows of `B` contiguous | blocks, with `B` read where it is |
 //! | else | blocks that fit the caches, packed into panels (Goto and van de Geijn 2008) |
 //!
 //! Packing `B` costs about as much as multiplying it by 16 rows, so it does not pay for a few.
