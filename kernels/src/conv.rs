@@ -2,9 +2,9 @@
 //!
 //! | pass | algorithm |
 //! |---|---|
-//! | forward | a sum over taps with vectors along the output rows ([`direct`]), of the image itself when the stride is 1 and nothing is padded, else of a copy that is padded and split into phases ([`prepare`]) |
-//! | input gradient | for each phase of the input the same sum over the zero-padded output gradient, with the kernel turned round ([`input_gradient`]); where that would mostly multiply zeros, a matrix product and [`crate::im2col::col2im`] |
-//! | weight gradient | vectors along the output rows, summed over lanes at the end ([`weight_gradient`]) |
+//! | forward | a sum over taps with vectors along the output rows (`direct`), of the image itself when the stride is 1 and nothing is padded, else of a copy that is padded and split into phases (`prepare`) |
+//! | input gradient | for each phase of the input the same sum over the zero-padded output gradient, with the kernel turned round (`input_gradient`); where that would mostly multiply zeros, a matrix product and [`crate::im2col::col2im`] |
+//! | weight gradient | vectors along the output rows, summed over lanes at the end (`weight_gradient`) |
 
 mod direct;
 mod grid;
@@ -167,7 +167,7 @@ per_isa! {
     ) {
         let (copy, packed) = scratch.split_at_mut(conv.copy_len(FORWARD_COPIES));
         let sum = &conv.sum;
-        sum.pack(direct::tile_height(S::MANY_REGISTERS, sum.channels), Some(bias), weight, packed);
+        sum.pack(simd, Some(bias), weight, packed);
         if !conv.layout.copies {
             return sum.run(simd, x, packed, y);
         }

@@ -2,8 +2,8 @@
 //!
 //! | condition | algorithm |
 //! |---|---|
-//! | at most [`FEW_ROWS`] rows; rows of `A` and columns of `B` contiguous | dot products ([`dots`]): nothing is packed |
-//! | at most [`FEW_ROWS`] rows; rows of `B` contiguous | blocks, with `B` read where it is |
+//! | at most 32 rows; rows of `A` and columns of `B` contiguous | dot products (`dots`): nothing is packed |
+//! | at most 32 rows; rows of `B` contiguous | blocks, with `B` read where it is |
 //! | else | blocks that fit the caches, packed into panels (Goto and van de Geijn 2008) |
 //!
 //! Packing `B` costs about as much as multiplying it by 16 rows, so it does not pay for a few.
@@ -18,11 +18,9 @@ const BLOCK_K: usize = 256;
 const BLOCK_M: usize = 96;
 /// Columns of a block of `B` (480 KiB).
 const BLOCK_N: usize = 480;
-/// Vectors in a tile.
-const TILE_VECTORS: usize = 3;
 /// The largest tile of any instruction set.
 const MOST_ROWS: usize = 8;
-const MOST_COLUMNS: usize = 16 * TILE_VECTORS;
+const MOST_COLUMNS: usize = 48;
 
 /// Up to as many rows of `A`, `B` is not packed.
 const FEW_ROWS: usize = 32;
@@ -31,7 +29,7 @@ const FEW_ROWS: usize = 32;
 pub fn gemm_scratch_len(m: usize, k: usize, n: usize) -> usize {
     // A product may be computed as that of the transposes, so either size may take either part.
     let depth = k.min(BLOCK_K);
-    let a = |m: usize| m.min(BLOCK_M).next_multiple_of(MOST_ROWS) * depth;
+    let a = |m: usize| (m.min(BLOCK_M) + MOST_ROWS) * depth;
     let b = |n: usize| n.min(BLOCK_N).next_multiple_of(MOST_COLUMNS) * depth;
     (a(m) + b(n)).max(a(n) + b(m)) + ALIGNMENT
 }
@@ -97,15 +95,15 @@ per_isa! {
         scratch: &mut [f32],
     ) {
         if S::MANY_REGISTERS {
-            blocks_of::<S, 8>(simd, sizes, alpha, a, b, beta, c, scratch);
+            blocks_of::<S, 8, 3>(simd, sizes, alpha, a, b, beta, c, scratch);
         } else {
-            blocks_of::<S, 4>(simd, sizes, alpha, a, b, beta, c, scratch);
+            blocks_of::<S, 6, 2>(simd, sizes, alpha, a, b, beta, c, scratch);
         }
     }
 }
 
 #[inline(always)]
-fn blocks_of<S: Simd, const MR: usize>(
+fn blocks_of<S: Simd, const MR: usize, const NV: usize>(
     simd: S,
     (m, k, n): (usize, usize, usize),
     alpha: f32,
@@ -115,7 +113,7 @@ fn blocks_of<S: Simd, const MR: usize>(
     (c, c_strides): (&mut [f32], (usize, usize)),
     scratch: &mut [f32],
 ) {
-    let columns = S::LANES * TILE_VECTORS;
+    let columns = S::LANES * NV;
     let packs = m > FEW_ROWS || b_strides.1 != 1;
     let (packed_b, packed_a) = align(scratch).split_at_mut(n.min(BLOCK_N).next_multiple_of(columns) * k.min(BLOCK_K));
     for first_n in (0..n).step_by(BLOCK_N) {
@@ -138,16 +136,16 @@ fn blocks_of<S: Simd, const MR: usize>(
                         let (rows, wide) = (MR.min(block_m - i), columns.min(block_n - j));
                         // An empty block has no panel, and an unpacked one ends with its last element.
                         let tile = if block_k == 0 {
-                            [[simd.splat(0.0); TILE_VECTORS]; MR]
+                            [[simd.splat(0.0); NV]; MR]
                         } else if packs {
                             let panel_b = &packed_b[j * block_k..][..columns * block_k];
-                            tile::<S, MR, false>(simd, panel_a, panel_b, columns, columns)
+                            tile::<S, MR, NV, false>(simd, panel_a, panel_b, columns, columns)
                         } else {
                             let panel_b = &b[from.0 + j..][..(block_k - 1) * b_strides.0 + wide];
                             if wide == columns {
-                                tile::<S, MR, false>(simd, panel_a, panel_b, b_strides.0, columns)
+                                tile::<S, MR, NV, false>(simd, panel_a, panel_b, b_strides.0, columns)
                             } else {
-                                tile::<S, MR, true>(simd, panel_a, panel_b, b_strides.0, wide)
+                                tile::<S, MR, NV, true>(simd, panel_a, panel_b, b_strides.0, wide)
                             }
                         };
                         let at = (first_m + i) * c_strides.0 + (first_n + j) * c_strides.1;
@@ -197,21 +195,21 @@ fn pack(
 
 /// The product of a panel of `A` and the `wide` columns of `B` that begin at `b[0]`, with rows `step` apart.
 #[inline(always)]
-fn tile<S: Simd, const MR: usize, const MASKED: bool>(
+fn tile<S: Simd, const MR: usize, const NV: usize, const MASKED: bool>(
     simd: S,
     a: &[f32],
     b: &[f32],
     step: usize,
     wide: usize,
-) -> [[S::V; TILE_VECTORS]; MR] {
+) -> [[S::V; NV]; MR] {
     let (a, _) = a.as_chunks::<MR>();
     assert!(a.is_empty() || (a.len() - 1) * step + wide <= b.len(), "gemm: a panel is too short");
-    assert!(MASKED || wide == S::LANES * TILE_VECTORS, "gemm: a tile is too narrow");
-    let mut sums = [[simd.splat(0.0); TILE_VECTORS]; MR];
+    assert!(MASKED || wide == S::LANES * NV, "gemm: a tile is too narrow");
+    let mut sums = [[simd.splat(0.0); NV]; MR];
     let mut row = b.as_ptr();
     for a in a {
-        let mut columns = [simd.splat(0.0); TILE_VECTORS];
-        for v in 0..TILE_VECTORS {
+        let mut columns = [simd.splat(0.0); NV];
+        for v in 0..NV {
             // SAFETY: each row has `wide` columns within `b`, as asserted; a tile that is not masked has all of them.
             columns[v] = unsafe {
                 let from = row.wrapping_add(v * S::LANES);
@@ -225,7 +223,7 @@ fn tile<S: Simd, const MR: usize, const MASKED: bool>(
         row = row.wrapping_add(step);
         for r in 0..MR {
             let weight = simd.splat(a[r]);
-            for v in 0..TILE_VECTORS {
+            for v in 0..NV {
                 sums[r][v] = simd.mul_add(columns[v], weight, sums[r][v]);
             }
         }
@@ -235,9 +233,9 @@ fn tile<S: Simd, const MR: usize, const MASKED: bool>(
 
 /// `C = alpha tile + beta C` for the first `rows` and `columns` of a tile that begins at `c[0]`.
 #[inline(always)]
-fn write<S: Simd, const MR: usize>(
+fn write<S: Simd, const MR: usize, const NV: usize>(
     simd: S,
-    tile: &[[S::V; TILE_VECTORS]; MR],
+    tile: &[[S::V; NV]; MR],
     alpha: f32,
     beta: f32,
     c: &mut [f32],
@@ -250,7 +248,7 @@ fn write<S: Simd, const MR: usize>(
         if r >= rows {
             break;
         }
-        for v in 0..TILE_VECTORS {
+        for v in 0..NV {
             let first = v * S::LANES;
             if first >= columns {
                 break;

@@ -126,6 +126,7 @@ macro_rules! per_isa {
                 // SAFETY: an `Isa` of this level exists only after detection found its features.
                 $crate::isa::Level::Avx2 => unsafe { avx2($($arg),*) },
                 #[cfg(target_arch = "aarch64")]
+                #[allow(unused_unsafe, reason = "targets that always have NEON may call this without `unsafe`")]
                 // SAFETY: an `Isa` of this level exists only after detection found its features.
                 $crate::isa::Level::Neon => unsafe { neon($($arg),*) },
                 _ => body($crate::simd::portable::Portable $(, $arg)*),

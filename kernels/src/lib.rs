@@ -14,7 +14,7 @@
 //! # Where things are
 //! [`isa`] detection · [`gemm`] matrix product · [`im2col`] image to patch matrix and back · [`conv`] convolution and
 //! its gradients · [`pool`] · [`activation`] · [`norm`] batch normalisation · [`update`] optimiser steps ·
-//! [`pixels`] bytes to floats · [`peak`] what the core can do at best · [`reference`] the naive loops that define
+//! [`pixels`] bytes to floats · [`peak`] what the core can do at best · [`mod@reference`] the naive loops that define
 //! each kernel.
 #![deny(unsafe_op_in_unsafe_fn)]
 // The tests and the kernels are written in terms of rows, columns and taps: indices are the clearest notation.

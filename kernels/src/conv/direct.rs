@@ -2,22 +2,19 @@
 //!
 //! A tile is 8 output channels by 3 vectors: 24 accumulators. For each tap it loads 3 vectors of the input, shifted by
 //! the offset of the tap, and multiplies them by 8 weights: 11 loads for 24 multiply-adds, so arithmetic is the limit.
-//! With 16 registers a tile has 4 channels. Each output is one chain of multiply-adds in the order of the taps, whatever
+//! With 16 registers a tile has 6 channels by 2 vectors, which leaves the compiler a register to spare. Each output is one chain of multiply-adds in the order of the taps, whatever
 //! the tile it falls in, so it does not depend on the number of images.
 
 use super::grid::Span;
 use crate::simd::Simd;
-
-/// Vectors in a tile.
-pub(crate) const TILE_VECTORS: usize = 3;
 
 /// Taps that all channels go through before the next: the input they touch, 1.3 to 1.6 cache lines each, then stays in
 /// the first-level cache. Between blocks the sums wait in the output.
 const BLOCK_TAPS: usize = 240;
 
 /// Output channels of a tile for `channels` in all: the height that leaves the fewest rows empty.
-pub(crate) fn tile_height(many_registers: bool, channels: usize) -> usize {
-    let heights: &[usize] = if many_registers { &[8, 6, 4] } else { &[4, 3] };
+fn tile_height(many_registers: bool, channels: usize) -> usize {
+    let heights: &[usize] = if many_registers { &[8, 6, 4] } else { &[6, 4] };
     *heights.iter().min_by_key(|&&height| channels.div_ceil(height) * height).unwrap_or(&4)
 }
 
@@ -47,9 +44,10 @@ impl TapSum {
         (self.channels + 8) * (self.taps.len() + 1)
     }
 
-    /// Packs bias (none: 0) and weights into panels of `height` channels: first the bias, then tap by tap.
+    /// Packs bias (none: 0) and weights into panels of a tile's channels: first the bias, then tap by tap.
     #[inline(always)]
-    pub fn pack(&self, height: usize, bias: Option<&[f32]>, weight: &[f32], packed: &mut [f32]) {
+    pub fn pack<S: Simd>(&self, _simd: S, bias: Option<&[f32]>, weight: &[f32], packed: &mut [f32]) {
+        let height = tile_height(S::MANY_REGISTERS, self.channels);
         let panels = packed.chunks_exact_mut(height * (self.taps.len() + 1));
         for (first, to) in (0..self.channels).step_by(height).zip(panels) {
             let rows = height.min(self.channels - first);
@@ -68,13 +66,12 @@ impl TapSum {
         }
     }
 
-    /// Computes the images in `x` with weights packed for `tile_height`; `y` is overwritten.
+    /// Computes the images in `x` with weights from [`TapSum::pack`]; `y` is overwritten.
     #[inline(always)]
     pub fn run<S: Simd>(&self, simd: S, x: &[f32], packed: &[f32], y: &mut [f32]) {
         match tile_height(S::MANY_REGISTERS, self.channels) {
             8 if S::MANY_REGISTERS => self.run_height::<S, 8>(simd, x, packed, y),
-            6 if S::MANY_REGISTERS => self.run_height::<S, 6>(simd, x, packed, y),
-            3 if !S::MANY_REGISTERS => self.run_height::<S, 3>(simd, x, packed, y),
+            6 => self.run_height::<S, 6>(simd, x, packed, y),
             _ => self.run_height::<S, 4>(simd, x, packed, y),
         }
     }
@@ -106,13 +103,14 @@ impl TapSum {
         assert!(packed.len() >= self.channels.div_ceil(MR) * panel_len, "tap sum: packed weights are too short");
         let farthest = self.farthest();
         let total = images * self.spans.len();
+        let tile_vectors = if S::MANY_REGISTERS { 3 } else { 2 };
         let mut next = 0;
         while next < total {
-            let count = (total - next).min(TILE_VECTORS);
+            let count = (total - next).min(tile_vectors);
             // SAFETY: `check` holds for every image, and tiles are asked for only existing vectors.
             unsafe {
                 match count {
-                    3 => self.column::<S, MR, 3>(simd, next, farthest, x, packed, y),
+                    3 if S::MANY_REGISTERS => self.column::<S, MR, 3>(simd, next, farthest, x, packed, y),
                     2 => self.column::<S, MR, 2>(simd, next, farthest, x, packed, y),
                     _ => self.column::<S, MR, 1>(simd, next, farthest, x, packed, y),
                 }

@@ -8,7 +8,7 @@
 //! A map of few rows is mostly border, where this sum multiplies zeros. There each window's gradient is computed once,
 //! `dy' W`, as a matrix product, and the windows are added up where they overlap.
 
-use super::direct::{TapSum, tile_height};
+use super::direct::TapSum;
 use super::prepare::put_every;
 use super::{ConvShape, FORWARD_COPIES, MOST_LANES, grid, group_of};
 use crate::Isa;
@@ -46,9 +46,10 @@ struct Part {
     sum: TapSum,
 }
 
-/// The share of multiplications that the sum over taps may waste on zeros and idle lanes: beyond 1.6 times the work
-/// that counts, the matrix product won in the benches (hyper's fifth layer, pilotnet's last two).
-const MOST_WORK: f64 = 1.6;
+/// The share of multiplications that the sum over taps may waste on zeros and idle lanes: beyond 2.5 times the work
+/// that counts, the matrix product wins in the benches (3x18 and 3x20 maps: by a quarter to a third; at 2.1 times, a
+/// 5x22 map, it loses by a quarter).
+const MOST_WORK: f64 = 2.5;
 
 /// The tables of the input gradient of one shape.
 #[derive(Clone, Debug)]
@@ -187,13 +188,12 @@ per_isa! {
         let (packed_len, phase_len) = gradient.part_lens();
         let (packed, scratch) = scratch.split_at_mut(packed_len);
         let (phase, copy) = scratch.split_at_mut(group * phase_len);
-        let height = tile_height(S::MANY_REGISTERS, c);
 
         let mut rest = &mut *packed;
         for part in &gradient.parts {
             let (to, after) = rest.split_at_mut(part.sum.packed_len());
             rest = after;
-            part.sum.pack(height, None, weight, to);
+            part.sum.pack(simd, None, weight, to);
         }
 
         // Input that no window touches keeps this zero; with stride 1 the single part writes everything.

@@ -5,7 +5,7 @@
 //! until the end. So that `dy` comes from the first-level cache, a chunk of `CHUNK` vectors is packed once and all taps
 //! run over it; the sums of a panel of channels wait in scratch meanwhile.
 
-use super::direct::{TapSum, tile_height};
+use super::direct::TapSum;
 use crate::simd::{ALIGNMENT, Simd, align};
 
 /// Taps in a tile.
@@ -34,11 +34,14 @@ pub(crate) fn run<S: Simd>(
     dbias: &mut [f32],
     scratch: &mut [f32],
 ) {
-    match tile_height(S::MANY_REGISTERS, sum.channels) {
+    // The height that leaves the fewest rows empty: 24 or 18 accumulators, or 12 or 9 where there are 16 registers.
+    let heights = if S::MANY_REGISTERS { [8, 6] } else { [4, 3] };
+    let rows = |height: usize| sum.channels.div_ceil(height) * height;
+    match if rows(heights[0]) <= rows(heights[1]) { heights[0] } else { heights[1] } {
         8 if S::MANY_REGISTERS => run_height::<S, 8>(simd, sum, x, dy, dweight, dbias, scratch),
         6 if S::MANY_REGISTERS => run_height::<S, 6>(simd, sum, x, dy, dweight, dbias, scratch),
-        3 if !S::MANY_REGISTERS => run_height::<S, 3>(simd, sum, x, dy, dweight, dbias, scratch),
-        _ => run_height::<S, 4>(simd, sum, x, dy, dweight, dbias, scratch),
+        4 => run_height::<S, 4>(simd, sum, x, dy, dweight, dbias, scratch),
+        _ => run_height::<S, 3>(simd, sum, x, dy, dweight, dbias, scratch),
     }
 }
 

@@ -3,6 +3,8 @@
 //! The token's constructor needs the instruction set itself, so whoever holds it may run its instructions; that is what
 //! every SAFETY line here without a pointer in it refers to.
 
+#![allow(unused_unsafe, reason = "targets that always have NEON may call its instructions without `unsafe`")]
+
 use super::Simd;
 use std::arch::aarch64::*;
 

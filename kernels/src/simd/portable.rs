@@ -19,7 +19,7 @@ impl Simd for Portable {
     #[inline(always)]
     fn mul_add(self, a: [f32; 4], b: [f32; 4], c: [f32; 4]) -> [f32; 4] {
         // Not `f32::mul_add`: without the instruction that is a slow call to the C library.
-        std::array::from_fn(|i| a[i] * b[i] + c[i])
+        [a[0] * b[0] + c[0], a[1] * b[1] + c[1], a[2] * b[2] + c[2], a[3] * b[3] + c[3]]
     }
 
     #[inline(always)]
