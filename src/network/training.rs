@@ -22,6 +22,9 @@ pub const MAX_SHARDS: usize = 16;
 /// Activations of the images that a shard takes at a time, in numbers, in networks without a barrier: about 1 MiB.
 const GROUP_NUMBERS: usize = 256 * 1024;
 
+/// Fewest images that a shard takes at a time, if it has as many: kernels prepare their weights once a call.
+const MIN_GROUP: usize = 8;
+
 /// Parameters that are reduced and updated as one task.
 pub const CHUNK: usize = 4096;
 
@@ -106,7 +109,7 @@ impl TrainingPlan {
         let group = if segments.len() > 1 {
             shard_capacity
         } else {
-            (GROUP_NUMBERS / per_image.max(1)).clamp(1, shard_capacity)
+            (GROUP_NUMBERS / per_image.max(1)).clamp(MIN_GROUP.min(shard_capacity), shard_capacity)
         };
         let scratch_len = layers.iter().map(|l| l.layer.scratch_len(group)).max().unwrap_or(0);
         let shards = (0..capacity.div_ceil(shard_capacity))
