@@ -1,0 +1,58 @@
+//! The car's bonnet, as each of the three cameras sees it.
+
+use super::camera::{HEIGHT, Mount, RgbFrame, WIDTH};
+use super::light::Variant;
+
+/// Row at which the bonnet begins in a column; `HEIGHT` where there is none.
+fn top(mount: Mount, column: usize) -> f32 {
+    let x = column as f32 + 0.5;
+    let none = HEIGHT as f32;
+    let quarter = |u: f32| if u.abs() < 1.0 { none - 24.0 * (1.0 - u * u * u * u).sqrt() } else { none };
+    match mount {
+        Mount::Center => {
+            let u = (x - 166.0) / 106.0;
+            (142.0 + 17.0 * u * u * (0.75 + 0.25 * u * u)).min(none)
+        }
+        Mount::Left => quarter((WIDTH as f32 - x) / 135.0),
+        Mount::Right => quarter(x / 122.0),
+    }
+}
+
+fn colour(mount: Mount, column: usize, depth: f32) -> [f32; 3] {
+    let x = column as f32;
+    if depth < 1.2 {
+        return [58.0, 52.0, 44.0];
+    }
+    if mount == Mount::Center {
+        // The rim, a dark seam, and the scoop behind it.
+        if depth < 8.5 {
+            let k = 1.0 - 0.045 * (depth - 4.0).abs();
+            [152.0 * k, 138.0 * k, 116.0 * k]
+        } else if depth < 10.0 {
+            [44.0, 42.0, 40.0]
+        } else {
+            [168.0, 174.0, 176.0]
+        }
+    } else {
+        let lamp = if mount == Mount::Left { 204.0 } else { 102.0 };
+        if (x - lamp).abs() < 9.0 && (2.5..10.5).contains(&depth) {
+            return [236.0, 234.0, 228.0];
+        }
+        let k = 1.05 - 0.018 * depth;
+        [142.0 * k, 128.0 * k, 108.0 * k]
+    }
+}
+
+/// Draws the bonnet over the bottom of the picture.
+pub(super) fn draw(mount: Mount, variant: &Variant, frame: &mut RgbFrame) {
+    for column in 0..WIDTH {
+        let top = top(mount, column);
+        for row in (top + 0.5) as usize..HEIGHT {
+            let rgb = colour(mount, column, row as f32 + 0.5 - top);
+            let at = (row * WIDTH + column) * 3;
+            for c in 0..3 {
+                frame.pixels[at + c] = variant.tone[c][rgb[c] as usize];
+            }
+        }
+    }
+}
