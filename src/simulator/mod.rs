@@ -7,6 +7,9 @@
 pub mod builtin;
 mod bonnet;
 pub mod camera;
+pub mod car;
+pub mod contact_sheet;
+pub mod expert;
 pub mod light;
 pub mod math;
 mod objects;
@@ -15,6 +18,7 @@ pub mod random_track;
 pub mod renderer;
 mod road_texture;
 mod sky;
+pub mod simulation;
 pub mod spec;
 mod terrain;
 pub mod track;
