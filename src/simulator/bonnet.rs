@@ -43,15 +43,33 @@ fn colour(mount: Mount, column: usize, depth: f32) -> [f32; 3] {
     }
 }
 
-/// Draws the bonnet over the bottom of the picture.
-pub(super) fn draw(mount: Mount, variant: &Variant, frame: &mut RgbFrame) {
-    for column in 0..WIDTH {
-        let top = top(mount, column);
-        for row in (top + 0.5) as usize..HEIGHT {
-            let rgb = colour(mount, column, row as f32 + 0.5 - top);
-            let at = (row * WIDTH + column) * 3;
+/// The pixels of the bonnet for each camera, painted once.
+pub(super) struct Bonnet([Vec<(usize, [u8; 3])>; 3]);
+
+impl Default for Bonnet {
+    fn default() -> Self {
+        Bonnet(Mount::ALL.map(|mount| {
+            let mut pixels = Vec::new();
+            for row in 0..HEIGHT {
+                for column in 0..WIDTH {
+                    let depth = row as f32 + 0.5 - top(mount, column);
+                    if depth > 0.0 {
+                        pixels.push(((row * WIDTH + column) * 3, colour(mount, column, depth).map(|c| c as u8)));
+                    }
+                }
+            }
+            pixels
+        }))
+    }
+}
+
+impl Bonnet {
+    /// Draws the bonnet over the bottom of the picture.
+    pub(super) fn draw(&self, mount: Mount, variant: &Variant, frame: &mut RgbFrame) {
+        let pixels = &self.0[Mount::ALL.iter().position(|m| *m == mount).unwrap_or(0)];
+        for (at, rgb) in pixels {
             for c in 0..3 {
-                frame.pixels[at + c] = variant.tone[c][rgb[c] as usize];
+                frame.pixels[at + c] = variant.tone[c][usize::from(rgb[c])];
             }
         }
     }

@@ -1,6 +1,7 @@
 //! What differs from run to run on the same track: light and texture.
 
-use super::math::{Rng, lerp};
+use super::math::Rng;
+use super::road_texture::pack;
 use super::world::World;
 
 /// The light and texture of one run. Variant 0 of a track is what its file says; other seeds depart from it.
@@ -8,10 +9,10 @@ use super::world::World;
 pub struct Variant {
     /// Moves the road's pattern along the road, m.
     pub road_shift_m: f32,
-    /// Factor (256 = 1) of red, green and blue of the road for each value of the land's light.
-    pub road_light: Vec<[u32; 3]>,
-    /// Colour of distant air.
-    pub haze: [u32; 3],
+    /// Factor (256 = 1, never more) of the road's colour for each value of the land's light.
+    pub road_light: [u16; 256],
+    /// Colour of distant air, `0x__BBGGRR`.
+    pub haze: u32,
     /// Final value for each red, green and blue.
     pub tone: [[u8; 256]; 3],
 }
@@ -27,16 +28,13 @@ impl Variant {
         let road = 1.0 + around(0.12);
         let depth = 1.0 + around(0.25);
         let road_shift_m = 64.0 * 24.0 + 12.0 * (1.0 + around(1.0));
-        let road_light = (0..256)
-            .map(|a| {
-                let light = a as f32 / super::terrain::FULL_LIGHT;
-                let light = (1.0 + (light - 1.0) * depth).max(0.08);
-                world.sun.map(|sun| (256.0 * light * road * lerp(1.0, sun, 0.8)) as u32)
-            })
-            .collect();
+        let road_light = std::array::from_fn(|a| {
+            let light = a as f32 / super::terrain::FULL_LIGHT;
+            (256.0 * (0.88 + (light - 1.0) * 0.88 * depth) * road).clamp(20.0, 256.0) as u16
+        });
         let tone = tint.map(|tint| {
             std::array::from_fn(|v| (((v as f32 - 110.0) * contrast + 110.0) * gain * tint + 0.5).clamp(0.0, 255.0) as u8)
         });
-        Variant { road_shift_m, road_light, haze: world.haze.map(|c| c as u32), tone }
+        Variant { road_shift_m, road_light, haze: pack(world.haze, 0.0), tone }
     }
 }

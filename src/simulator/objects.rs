@@ -2,7 +2,7 @@
 
 use super::camera::{FOCAL_PX, HEIGHT, RgbFrame, WIDTH};
 use super::math::{Vec3, hash2, lerp};
-use super::renderer::{Renderer, View};
+use super::renderer::View;
 use super::spec::Wall;
 use super::world::{Sprite, WallPiece};
 
@@ -12,20 +12,16 @@ const NEAREST_M: f32 = 0.35;
 const FARTHEST_M: f32 = 330.0;
 
 /// Draws walls and sprites over the ground of `frame`.
-pub(super) fn draw(renderer: &mut Renderer, view: &View, frame: &mut RgbFrame) {
+pub(super) fn draw(depths: &mut [f32], view: &View, frame: &mut RgbFrame) {
     for piece in &view.world.walls {
-        draw_wall(renderer, view, piece, frame);
+        draw_wall(depths, view, piece, frame);
     }
     for sprite in &view.world.sprites {
-        draw_sprite(renderer, view, sprite, frame);
+        draw_sprite(depths, view, sprite, frame);
     }
 }
 
-fn haze(view: &View, depth: f32) -> u32 {
-    (256.0 * depth / (depth + view.world.haze_m)) as u32
-}
-
-fn draw_sprite(renderer: &mut Renderer, view: &View, sprite: &Sprite, frame: &mut RgbFrame) {
+fn draw_sprite(depths: &mut [f32], view: &View, sprite: &Sprite, frame: &mut RgbFrame) {
     let foot = view.camera.view(sprite.foot);
     if foot.z < 1.5 || foot.z > FARTHEST_M || foot.x.abs() > 1.3 * foot.z + 6.0 {
         return;
@@ -42,8 +38,8 @@ fn draw_sprite(renderer: &mut Renderer, view: &View, sprite: &Sprite, frame: &mu
         return;
     }
     let (texels, w, h) = picture.level(high);
-    let light = (sprite.light * 256.0) as u32;
-    let (inverse, haze) = (1.0 / foot.z, haze(view, foot.z));
+    let light = (sprite.light * 256.0).min(256.0) as u32;
+    let (inverse, haze) = (1.0 / foot.z, view.air(foot.z));
     let (du, dv) = (w as f32 / wide, h as f32 / high);
     let first_row = (top + 0.5) as usize;
     let last_row = (bottom + 0.5) as usize;
@@ -55,15 +51,16 @@ fn draw_sprite(renderer: &mut Renderer, view: &View, sprite: &Sprite, frame: &mu
         let last = ((left + wide + 0.5).max(0.0) as usize).min(WIDTH);
         for column in first..last {
             let at = row * WIDTH + column;
-            if renderer.depths[at] > inverse {
+            if depths[at] > inverse {
                 continue;
             }
             let u = (((column as f32 + 0.5 - left) * du).max(0.0) as usize).min(w - 1);
             let texel = texels[v * w + if sprite.mirrored { w - 1 - u } else { u }];
             if texel >> 31 == 1 {
-                renderer.depths[at] = inverse;
-                let rgb = [texel, texel >> 8, texel >> 16].map(|c| (c & 255) * light >> 8);
-                view.finish(rgb, haze, &mut frame.pixels[3 * at..3 * at + 3]);
+                depths[at] = inverse;
+                let red_blue = ((texel & 0x00ff_00ff) * light >> 8) & 0x00ff_00ff;
+                let green = (texel >> 8 & 255) * light >> 8;
+                view.finish(red_blue | green << 8, haze, &mut frame.pixels[3 * at..3 * at + 3]);
             }
         }
     }
@@ -106,7 +103,7 @@ fn wall_colour(wall: Wall, along_m: f32, up_m: f32) -> Option<[f32; 3]> {
     }
 }
 
-fn draw_wall(renderer: &mut Renderer, view: &View, piece: &WallPiece, frame: &mut RgbFrame) {
+fn draw_wall(depths: &mut [f32], view: &View, piece: &WallPiece, frame: &mut RgbFrame) {
     let (mut a, mut b) = (view.camera.view(piece.from), view.camera.view(piece.to));
     if a.z.max(b.z) < NEAREST_M || a.z.min(b.z) > FARTHEST_M / 2.0 {
         return;
@@ -138,18 +135,18 @@ fn draw_wall(renderer: &mut Renderer, view: &View, piece: &WallPiece, frame: &mu
         let along_m = piece.along_m + lerp(u0 * i0, u1 * i1, t) / inverse;
         let per_m = FOCAL_PX * inverse * up;
         let (top, bottom) = (foot - high_m * per_m, foot - low_m * per_m);
-        let haze = haze(view, 1.0 / inverse);
+        let haze = view.air(1.0 / inverse);
         let rows = (top + 0.5).clamp(0.0, HEIGHT as f32) as usize..(bottom + 1.0).clamp(0.0, HEIGHT as f32) as usize;
         for row in rows {
             let at = row * WIDTH + column;
             // A wall stands on the ground: leave some room for the ground's own unevenness.
-            if renderer.depths[at] > inverse * 1.03 {
+            if depths[at] > inverse * 1.03 {
                 continue;
             }
             if let Some(rgb) = wall_colour(piece.wall, along_m, (foot - row as f32 - 0.5) / per_m) {
-                renderer.depths[at] = inverse;
+                depths[at] = inverse;
                 let rgb = rgb.map(|c| (c * piece.light.min(1.1)) as u32);
-                view.finish(rgb, haze, &mut frame.pixels[3 * at..3 * at + 3]);
+                view.finish(rgb[0] | rgb[1] << 8 | rgb[2] << 16, haze, &mut frame.pixels[3 * at..3 * at + 3]);
             }
         }
     }

@@ -11,14 +11,14 @@
 //! 3. *Stand*: walls and upright things are drawn where they are nearer than the ground.
 //! 4. *Bonnet*: the car's own bonnet, which is always in the same place.
 
-use super::bonnet;
+use super::bonnet::Bonnet;
 use super::camera::{Camera, FOCAL_PX, HEIGHT, Mount, RgbFrame, WIDTH};
 use super::light::Variant;
 use super::math::{Vec3, atan2, vec3};
 use super::objects;
-use super::road_texture::{HALF_M, Level, RoadTexture};
+use super::road_texture::{ACROSS_UNITS, ACROSS_UNITS_PER_M, ALONG_UNITS_PER_M, HALF_M, Level};
 use super::sky::AROUND;
-use super::terrain::{GroundLevel, NO_STATION};
+use super::terrain::{GROUND_UNITS_PER_M, GroundLevel, NO_STATION, clip};
 use super::world::World;
 
 /// Pixels between marched columns.
@@ -27,6 +27,8 @@ const SPAN: usize = 4;
 const ANCHORS: usize = WIDTH / SPAN + 1;
 /// Nothing farther than this is drawn as land, m.
 const FARTHEST_M: f32 = 380.0;
+/// Land this near takes the light at its very place, smoothly; farther the light of a texel of the map, m.
+const SMOOTH_LIGHT_M: f32 = 45.0;
 
 /// Takes pictures; keeps its buffers from one to the next.
 pub struct Renderer {
@@ -34,11 +36,16 @@ pub struct Renderer {
     anchors: Vec<f32>,
     /// Inverse depth at each pixel; 0 = sky.
     pub(super) depths: Vec<f32>,
+    bonnet: Bonnet,
 }
 
 impl Default for Renderer {
     fn default() -> Self {
-        Renderer { anchors: vec![0.0; HEIGHT * ANCHORS], depths: vec![0.0; HEIGHT * WIDTH] }
+        Renderer {
+            anchors: vec![0.0; HEIGHT * ANCHORS],
+            depths: vec![0.0; HEIGHT * WIDTH],
+            bonnet: Bonnet::default(),
+        }
     }
 }
 
@@ -49,43 +56,77 @@ pub(super) struct View<'a> {
     pub(super) camera: &'a Camera,
     /// Grid coordinates of the eye; z is its height.
     eye: Vec3,
+    /// Largest grid coordinates.
+    limit: (f32, f32),
+    columns: [Column; ANCHORS],
+}
+
+/// What the rays of one marched column have in common.
+#[derive(Clone, Copy, Default)]
+struct Column {
+    /// Ray at the middle row; each row adds its share of the camera's up.
+    middle: Vec3,
+    /// One over the horizontal length of a ray.
+    level: f32,
+    /// Place on the sky's picture.
+    turn: f32,
 }
 
 /// The ground at one place of the picture.
 #[derive(Clone, Copy, Default)]
 struct Spot {
-    /// Inverse depth, 1/m; 0 = sky.
+    /// Depth, m, and its inverse, which is 0 for the sky.
+    depth: f32,
     inverse: f32,
-    /// Grid coordinates, m.
-    gx: f32,
-    gy: f32,
-    /// Nearest station, or `NO_STATION`.
-    station: u16,
+    /// Place on the land's map, fixed-point.
+    x: i32,
+    y: i32,
+    /// Whether a road is near, and then: its look, place on its texture, fixed-point, light there, and how much it runs
+    /// along (cosine) and across (sine) the view.
+    near_road: bool,
     look: u32,
-    /// Place on the road's texture, m.
-    along: f32,
-    across: f32,
+    along: i32,
+    across: i32,
+    light: u32,
+    cos: f32,
+    sin: f32,
+}
+
+/// A place between two spots: on the land, and on the road.
+#[derive(Clone, Copy)]
+struct Place {
+    x: i32,
+    y: i32,
+    along: i32,
+    across: i32,
 }
 
 impl Renderer {
     /// Takes the picture that `camera` (mounted at `mount`) sees of `world` under `variant`.
     pub fn render(&mut self, world: &World, variant: &Variant, camera: &Camera, mount: Mount, frame: &mut RgbFrame) {
         let eye = vec3(camera.eye.x - world.terrain.x0, camera.eye.y - world.terrain.y0, camera.eye.z);
-        let view = View { world, variant, camera, eye };
+        let columns = std::array::from_fn(|k| {
+            let column = (k * SPAN) as f32 + 0.5;
+            let ray = camera.ray(column, HEIGHT as f32 / 2.0);
+            let sky = camera.ray(column, 30.0);
+            let turn = atan2(f64::from(sky.y), f64::from(sky.x)) / std::f64::consts::TAU;
+            Column { middle: ray, level: 1.0 / (ray.x * ray.x + ray.y * ray.y).sqrt(), turn: turn as f32 * AROUND as f32 }
+        });
+        let limit = (world.terrain.nx as f32 - 1.01, world.terrain.ny as f32 - 1.01);
+        let view = View { world, variant, camera, eye, limit, columns };
         frame.pixels.resize(WIDTH * HEIGHT * 3, 0);
         for k in 0..ANCHORS {
             self.march_column(&view, k);
         }
         self.shade(&view, frame);
-        objects::draw(self, &view, frame);
-        bonnet::draw(mount, variant, frame);
+        objects::draw(&mut self.depths, &view, frame);
+        self.bonnet.draw(mount, variant, frame);
     }
 
     fn march_column(&mut self, view: &View, k: usize) {
-        let column = (k * SPAN) as f32 + 0.5;
         let (mut depth, mut fall) = (0.9, -1.0);
         for row in (0..HEIGHT).rev() {
-            let ray = view.camera.ray(column, row as f32 + 0.5);
+            let ray = view.ray(k, row);
             match view.march(ray, depth, fall) {
                 Some(hit) => {
                     self.anchors[row * ANCHORS + k] = 1.0 / hit;
@@ -102,30 +143,25 @@ impl Renderer {
     }
 
     fn shade(&mut self, view: &View, frame: &mut RgbFrame) {
-        let camera = view.camera;
-        let turns: [f32; ANCHORS] = std::array::from_fn(|k| {
-            let ray = camera.ray((k * SPAN) as f32 + 0.5, 30.0);
-            (atan2(f64::from(ray.y), f64::from(ray.x)) / std::f64::consts::TAU * AROUND as f64) as f32
-        });
         let mut spots = [Spot::default(); ANCHORS];
         for row in 0..HEIGHT {
             let inverses = &self.anchors[row * ANCHORS..(row + 1) * ANCHORS];
+            let below = &self.anchors[(row + 1).min(HEIGHT - 1) * ANCHORS..][..ANCHORS];
             for (k, spot) in spots.iter_mut().enumerate() {
-                *spot = view.spot(camera.ray((k * SPAN) as f32 + 0.5, row as f32 + 0.5), inverses[k]);
+                *spot = view.spot(view.ray(k, row), view.columns[k].level, inverses[k]);
             }
-            let below = (row + 1).min(HEIGHT - 1);
             let pixels = &mut frame.pixels[row * WIDTH * 3..(row + 1) * WIDTH * 3];
             let depths = &mut self.depths[row * WIDTH..(row + 1) * WIDTH];
             for (k, (out, depth)) in pixels.chunks_exact_mut(3 * SPAN).zip(depths.chunks_exact_mut(SPAN)).enumerate() {
-                let (mut a, mut b) = (spots[k], spots[k + 1]);
-                let fall = (self.anchors[below * ANCHORS + k] - a.inverse).abs().max(1e-5);
+                let (a, b) = (&spots[k], &spots[k + 1]);
                 if a.inverse == 0.0 && b.inverse == 0.0 {
                     depth.fill(0.0);
-                    view.shade_sky(row, k, turns[k], turns[k + 1], out);
-                } else if view.join(&mut a, &mut b) {
-                    view.shade_span(&a, &b, fall, out, depth);
+                    view.shade_sky(row, k, out);
+                } else if let Some(lap) = view.join(a, b) {
+                    let fall = (below[k] - a.inverse).abs();
+                    view.shade_span(a, b, lap, fall, out, depth);
                 } else {
-                    view.shade_each(row, k, &a, &b, turns[k], out, depth);
+                    view.shade_each(row, k, a, b, out, depth);
                 }
             }
         }
@@ -133,6 +169,12 @@ impl Renderer {
 }
 
 impl View<'_> {
+    /// Ray through a marched column at a row.
+    #[inline(always)]
+    fn ray(&self, k: usize, row: usize) -> Vec3 {
+        self.columns[k].middle + self.camera.up * ((HEIGHT as f32 / 2.0 - 0.5 - row as f32) * (1.0 / FOCAL_PX))
+    }
+
     /// Follows a ray from `from` (a depth where it is known to be above the land) to where it enters the land.
     ///
     /// `last_fall` is the fall of the ray below, which met the land at `from`: on even land it tells where this one will.
@@ -141,178 +183,195 @@ impl View<'_> {
         let gap = |t: f32| {
             self.eye.z + t * ray.z - self.world.terrain.height_at_grid(self.eye.x + t * ray.x, self.eye.y + t * ray.y)
         };
-        let (mut near, mut near_gap) = (from, (from * (ray.z - last_fall)).max(1e-4));
-        let mut step = (0.04 * near).max(0.4);
+        let (mut near, mut near_gap) = (from, from * (ray.z - last_fall));
+        let mut step = 0.4 + 0.04 * near;
         if ray.z < -0.01 {
-            step = step.min(1.25 * near * (last_fall / ray.z - 1.0)).max(0.01);
+            let even = 1.25 * near * (last_fall / ray.z - 1.0);
+            step = if even < step { even.abs() + 0.01 } else { step };
         }
         loop {
             let far = near + step;
             let far_gap = gap(far);
             if far_gap <= 0.0 {
-                let t = near + step * near_gap / (near_gap - far_gap);
-                return Some(t);
+                return Some(near + step * near_gap / (near_gap - far_gap));
             }
             if far > FARTHEST_M {
                 return None;
             }
             (near, near_gap) = (far, far_gap);
-            step = (0.032 * near).max(0.3);
+            step = 0.2 + 0.032 * near;
         }
     }
 
-    /// The ground at the end of a ray.
+    /// The ground at the end of a ray; `level` is one over the ray's horizontal length.
     #[inline(always)]
-    fn spot(&self, ray: Vec3, inverse: f32) -> Spot {
+    fn spot(&self, ray: Vec3, level: f32, inverse: f32) -> Spot {
         if inverse == 0.0 {
             return Spot::default();
         }
         let depth = 1.0 / inverse;
-        let (gx, gy) = (self.eye.x + depth * ray.x, self.eye.y + depth * ray.y);
+        let gx = clip(self.eye.x + depth * ray.x, self.limit.0);
+        let gy = clip(self.eye.y + depth * ray.y, self.limit.1);
+        let (x, y) = ((gx * GROUND_UNITS_PER_M) as i32, (gy * GROUND_UNITS_PER_M) as i32);
+        let mut spot = Spot { depth, inverse, x, y, ..Spot::default() };
         let station = self.world.terrain.station_at_grid(gx, gy);
         if station == NO_STATION {
-            return Spot { inverse, gx, gy, station, look: 0, along: 0.0, across: 1e3 };
+            return spot;
         }
         let s = &self.world.road[usize::from(station)];
         let (dx, dy) = (gx - s.gx, gy - s.gy);
         let along = dx * s.tx + dy * s.ty;
         let right = dx * s.ty - dy * s.tx;
-        let stretch = (1.0 - s.curvature * right).max(0.3);
-        let arc = along / stretch;
-        let across = (right - s.curvature * along * arc * 0.5) * s.across_scale;
-        Spot { inverse, gx, gy, station, look: s.look, along: s.along_m + arc + self.variant.road_shift_m, across }
+        // On the circle of the station's curvature; near enough for the short way to the nearest station.
+        let arc = along * (1.0 + s.curvature * right);
+        let across = (right - 0.5 * s.curvature * along * arc) * s.across_scale;
+        if across.abs() > HALF_M + 4.0 {
+            return spot;
+        }
+        spot.near_road = true;
+        spot.look = s.look;
+        spot.along = ((s.along_m + arc + self.variant.road_shift_m) * ALONG_UNITS_PER_M) as i32;
+        spot.across = ((across + HALF_M) * ACROSS_UNITS_PER_M) as i32;
+        spot.cos = ((ray.x * s.tx + ray.y * s.ty) * level).abs();
+        spot.sin = ((ray.x * s.ty - ray.y * s.tx) * level).abs();
+        if depth < SMOOTH_LIGHT_M {
+            spot.light = u32::from(self.variant.road_light[self.world.ground.light(gx, gy) as u8 as usize]);
+        }
+        spot
     }
 
-    /// Whether the ground runs smoothly from `a` to `b`; brings their places along the road to the same lap.
+    /// Whether the ground runs smoothly from `a` to `b`; then what to add to the place of `b` along the road so that both
+    /// are on the same lap.
     #[inline(always)]
-    fn join(&self, a: &mut Spot, b: &mut Spot) -> bool {
-        if a.inverse == 0.0 || b.inverse == 0.0 || a.inverse > 1.2 * b.inverse || b.inverse > 1.2 * a.inverse {
-            return false;
+    fn join(&self, a: &Spot, b: &Spot) -> Option<i32> {
+        // The sky has inverse depth 0 and so never joins land.
+        if a.inverse > 1.2 * b.inverse || b.inverse > 1.2 * a.inverse {
+            return None;
         }
-        if a.across.abs() > HALF_M && b.across.abs() > HALF_M {
-            // No road at either end; between them only if they lie on different sides of one.
-            let far = a.station == NO_STATION || b.station == NO_STATION;
-            if far || a.across * b.across > 0.0 {
-                return true;
-            }
+        if !a.near_road && !b.near_road {
+            return Some(0);
         }
-        let length = self.world.road_length_m;
-        if a.along - b.along > length / 2.0 {
-            b.along += length;
-        } else if b.along - a.along > length / 2.0 {
-            a.along += length;
+        if a.near_road != b.near_road || a.look != b.look {
+            return None;
         }
-        // Four pixels at this depth cover four pixel widths of ground, or more if it runs away from the camera.
-        let reach = (24.0 / (FOCAL_PX * a.inverse)).max(0.5) * 3.0;
-        a.look == b.look && (a.along - b.along).abs() < reach && (a.across - b.across).abs() < reach
+        let length = (self.world.road_length_m * ALONG_UNITS_PER_M) as i32;
+        let way = b.along - a.along;
+        let lap = if way > length / 2 { -length } else if way < -length / 2 { length } else { 0 };
+        let limit = ((1.5 + 0.6 * a.depth) * ACROSS_UNITS_PER_M) as i32;
+        ((way + lap).abs() < limit && (b.across - a.across).abs() < limit).then_some(lap)
     }
 
-    /// Looks up the resolution that fits: the road's texture and the land's map.
+    /// The resolution that fits: the road's texture and the land's map; and the air's share of the colour.
     #[inline(always)]
     fn levels(&self, a: &Spot, fall: f32) -> (Level<'_>, GroundLevel<'_>, u32) {
-        let depth = 1.0 / a.inverse;
-        let wide = depth / FOCAL_PX;
-        let long = depth * depth * fall;
-        let (mut cos, mut sin) = (1.0, 0.0);
-        if a.station != NO_STATION {
-            let s = &self.world.road[usize::from(a.station)];
-            let (dx, dy) = (a.gx - self.eye.x, a.gy - self.eye.y);
-            let norm = 1.0 / (dx * dx + dy * dy).sqrt().max(1e-3);
-            cos = ((dx * s.tx + dy * s.ty) * norm).abs();
-            sin = ((dx * s.ty - dy * s.tx) * norm).abs();
-        }
-        let texture: &RoadTexture = &self.world.textures[a.look as usize];
-        let road = texture.level((cos * long).max(sin * wide), (sin * long).max(cos * wide));
-        let ground = self.world.ground.level((wide * (2.0 * wide).max(long)).sqrt());
-        let haze = (256.0 * depth / (depth + self.world.haze_m)) as u32;
-        (road, ground, haze)
+        let wide = a.depth * (1.0 / FOCAL_PX);
+        let long = a.depth * a.depth * fall;
+        let larger = |p: f32, q: f32| if p > q { p } else { q };
+        let along = larger(a.cos * long, a.sin * wide);
+        let across = larger(a.sin * long, a.cos * wide);
+        let road = self.world.textures[a.look as usize].level(along, across);
+        let ground = self.world.ground.level(wide * larger(2.0 * wide, long));
+        (road, ground, self.air(a.depth))
+    }
+
+    /// Share of the air, of 256, in the colour of a thing at `depth`.
+    #[inline(always)]
+    pub(super) fn air(&self, depth: f32) -> u32 {
+        (256.0 * depth / (depth + self.world.haze_m)) as u8 as u32
     }
 
     #[inline(always)]
-    fn shade_span(&self, a: &Spot, b: &Spot, fall: f32, out: &mut [u8], depths: &mut [f32]) {
-        let (road, ground, haze) = self.levels(a, fall);
-        let quarter = 1.0 / SPAN as f32;
-        let (dgx, dgy) = ((b.gx - a.gx) * quarter, (b.gy - a.gy) * quarter);
-        let (du, dv) = ((b.along - a.along) * quarter, (b.across - a.across) * quarter);
-        let di = (b.inverse - a.inverse) * quarter;
-        for (k, (out, depth)) in out.chunks_exact_mut(3).zip(depths).enumerate() {
-            let k = k as f32;
-            *depth = a.inverse + di * k;
-            let place = (a.gx + dgx * k, a.gy + dgy * k, a.along + du * k, a.across + dv * k);
-            self.put(place, &road, &ground, haze, out);
+    fn shade_span(&self, a: &Spot, b: &Spot, lap: i32, fall: f32, out: &mut [u8], depths: &mut [f32]) {
+        let (road, ground, air) = self.levels(a, fall);
+        let (dx, dy) = ((b.x - a.x) / SPAN as i32, (b.y - a.y) / SPAN as i32);
+        let (du, dv) = ((b.along + lap - a.along) / SPAN as i32, (b.across - a.across) / SPAN as i32);
+        let di = (b.inverse - a.inverse) * (1.0 / SPAN as f32);
+        let mut place = Place { x: a.x, y: a.y, along: a.along, across: a.across };
+        let mut inverse = a.inverse;
+        for (out, depth) in out.chunks_exact_mut(3).zip(depths) {
+            *depth = inverse;
+            self.put(place, a, &road, &ground, air, out);
+            inverse += di;
+            place = Place { x: place.x + dx, y: place.y + dy, along: place.along + du, across: place.across + dv };
         }
     }
 
-    /// Colours one pixel of ground.
+    /// Colours one pixel of ground. Red and blue are computed in one word, green in another.
     #[inline(always)]
-    fn put(&self, place: (f32, f32, f32, f32), road: &Level, ground: &GroundLevel, haze: u32, out: &mut [u8]) {
-        let (gx, gy, along, across) = place;
-        let land = ground.fetch(gx, gy);
-        let mut rgb = [land & 255, land >> 8 & 255, land >> 16 & 255];
-        if across.abs() < HALF_M {
-            let texel = road.fetch(along, across);
-            let alpha = texel >> 24;
-            if alpha > 0 {
-                let light = &self.variant.road_light[(land >> 24) as usize];
-                let lit = [0, 1, 2].map(|c| (texel >> (8 * c) & 255) * light[c] >> 8);
-                for c in 0..3 {
-                    rgb[c] = if alpha == 255 { lit[c] } else { (lit[c] * alpha + rgb[c] * (255 - alpha)) / 255 };
-                }
+    fn put(&self, place: Place, spot: &Spot, road: &Level, ground: &GroundLevel, air: u32, out: &mut [u8]) {
+        const RED_BLUE: u32 = 0x00ff_00ff;
+        let mut texel = 0;
+        if spot.near_road && (place.across as u32) < ACROSS_UNITS {
+            texel = road.fetch(place.along, place.across as u32);
+        }
+        let (mut light, mut land) = (spot.light, 0);
+        if texel >> 24 != 255 || light == 0 {
+            land = ground.fetch(place.x, place.y);
+            if light == 0 {
+                light = u32::from(self.variant.road_light[(land >> 24) as usize]);
             }
         }
-        self.finish(rgb, haze, out);
-    }
-
-    /// Adds air and the light of the run, and writes the pixel.
-    #[inline(always)]
-    pub(super) fn finish(&self, rgb: [u32; 3], haze: u32, out: &mut [u8]) {
-        for c in 0..3 {
-            let v = (rgb[c] * (256 - haze) + self.variant.haze[c] * haze) >> 8;
-            out[c] = self.variant.tone[c][v.min(255) as usize];
+        let mut red_blue = ((texel & RED_BLUE) * light >> 8) & RED_BLUE;
+        let mut green = (texel >> 8 & 255) * light >> 8;
+        if texel >> 24 != 255 {
+            let alpha = texel >> 24;
+            red_blue = (red_blue * alpha + (land & RED_BLUE) * (256 - alpha)) >> 8 & RED_BLUE;
+            green = (green * alpha + (land >> 8 & 255) * (256 - alpha)) >> 8;
         }
+        self.finish(red_blue | green << 8, air, out);
+    }
+
+    /// Adds air and the light of the run, and writes the pixel. `colour` is `0x__BBGGRR`.
+    #[inline(always)]
+    pub(super) fn finish(&self, colour: u32, air: u32, out: &mut [u8]) {
+        const RED_BLUE: u32 = 0x00ff_00ff;
+        let haze = self.variant.haze;
+        let red_blue = ((colour & RED_BLUE) * (256 - air) + (haze & RED_BLUE) * air) >> 8;
+        let green = ((colour >> 8 & 255) * (256 - air) + (haze >> 8 & 255) * air) >> 8;
+        let tone = &self.variant.tone;
+        out[0] = tone[0][(red_blue & 255) as usize];
+        out[1] = tone[1][(green & 255) as usize];
+        out[2] = tone[2][(red_blue >> 16 & 255) as usize];
     }
 
     #[inline(always)]
-    fn shade_sky(&self, row: usize, k: usize, turn_a: f32, turn_b: f32, out: &mut [u8]) {
-        let tangent = |column: usize| {
-            let ray = self.camera.ray(column as f32 + 0.5, row as f32 + 0.5);
-            ray.z / (ray.x * ray.x + ray.y * ray.y).sqrt()
-        };
-        let (from, to) = (tangent(k * SPAN), tangent((k + 1) * SPAN));
-        let mut dturn = turn_b - turn_a;
-        if dturn.abs() > AROUND as f32 / 2.0 {
-            dturn -= (AROUND as f32).copysign(dturn);
+    fn shade_sky(&self, row: usize, k: usize, out: &mut [u8]) {
+        let (a, b) = (&self.columns[k], &self.columns[k + 1]);
+        let from = self.ray(k, row).z * a.level;
+        let step = (self.ray(k + 1, row).z * b.level - from) * (1.0 / SPAN as f32);
+        let mut turn = b.turn - a.turn;
+        if turn.abs() > AROUND as f32 / 2.0 {
+            turn -= (AROUND as f32).copysign(turn);
         }
         for (i, out) in out.chunks_exact_mut(3).enumerate() {
-            let t = i as f32 / SPAN as f32;
-            self.put_sky(turn_a + dturn * t, from + (to - from) * t, out);
+            let t = i as f32;
+            self.put_sky(a.turn + turn * t * (1.0 / SPAN as f32), from + step * t, out);
         }
     }
 
     #[inline(always)]
     fn put_sky(&self, turn: f32, tangent: f32, out: &mut [u8]) {
-        let texel = self.world.sky.fetch(turn + 2.0 * AROUND as f32, tangent);
-        self.finish([texel & 255, texel >> 8 & 255, texel >> 16 & 255], 0, out);
+        self.finish(self.world.sky.fetch(turn, tangent), 0, out);
     }
 
     /// Colours four pixels between which the ground breaks off, each on its own.
-    #[allow(clippy::too_many_arguments, reason = "the two ends of a span, its place, and the two buffers it fills")]
-    fn shade_each(&self, row: usize, k: usize, a: &Spot, b: &Spot, turn: f32, out: &mut [u8], depths: &mut [f32]) {
+    fn shade_each(&self, row: usize, k: usize, a: &Spot, b: &Spot, out: &mut [u8], depths: &mut [f32]) {
         let nearest = 0.93 / a.inverse.max(b.inverse);
+        let level = self.columns[k].level;
         for (i, (out, depth)) in out.chunks_exact_mut(3).zip(depths).enumerate() {
-            let ray = self.camera.ray((k * SPAN + i) as f32 + 0.5, row as f32 + 0.5);
-            let hit = self.march(ray, nearest, ray.z - 0.02);
-            *depth = hit.map_or(0.0, |t| 1.0 / t);
-            if hit.is_none() {
-                self.put_sky(turn, ray.z / (ray.x * ray.x + ray.y * ray.y).sqrt(), out);
+            let ray = self.ray(k, row) + self.camera.right * (i as f32 / FOCAL_PX);
+            let Some(hit) = self.march(ray, nearest, ray.z - 0.02) else {
+                *depth = 0.0;
+                self.put_sky(self.columns[k].turn - i as f32 * AROUND as f32 / 900.0, ray.z * level, out);
                 continue;
-            }
-            let spot = self.spot(ray, *depth);
-            let lower = self.camera.ray((k * SPAN + i) as f32 + 0.5, row as f32 + 1.5);
+            };
+            *depth = 1.0 / hit;
+            let spot = self.spot(ray, level, *depth);
             // On level ground inverse depth grows with the fall of the ray.
-            let fall = ((lower.z / ray.z.min(-1e-3) - 1.0).abs() * spot.inverse).clamp(1e-5, 0.05);
-            let (road, ground, haze) = self.levels(&spot, fall);
-            self.put((spot.gx, spot.gy, spot.along, spot.across), &road, &ground, haze, out);
+            let fall = (self.camera.up.z / FOCAL_PX / (ray.z - 1e-3).abs()).min(1.0) * spot.inverse;
+            let (road, ground, air) = self.levels(&spot, fall);
+            let place = Place { x: spot.x, y: spot.y, along: spot.along, across: spot.across };
+            self.put(place, &spot, &road, &ground, air, out);
         }
     }
 }

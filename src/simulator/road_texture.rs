@@ -28,49 +28,55 @@ pub struct RoadTexture {
 #[derive(Clone, Copy)]
 pub struct Level<'a> {
     texels: &'a [u32],
-    along_per_m: f32,
-    across_per_m: f32,
+    /// Shifts that bring fixed-point places to texels of this level.
+    along_shift: u32,
+    across_shift: u32,
     along_mask: usize,
-    log2_along: u32,
+    log2_across: u32,
 }
 
+/// Bits behind the point of fixed-point places; the unit is the finest texel.
+pub const FRACTION_BITS: u32 = 12;
+/// Fixed-point units for each metre along the road.
+pub const ALONG_UNITS_PER_M: f32 = (SIZE << FRACTION_BITS) as f32 / PERIOD_M;
+/// Fixed-point units for each metre across.
+pub const ACROSS_UNITS_PER_M: f32 = (SIZE << FRACTION_BITS) as f32 / (2.0 * HALF_M);
+/// Places across at or above this are beyond the texture.
+pub const ACROSS_UNITS: u32 = (SIZE << FRACTION_BITS) as u32;
+
 impl Level<'_> {
-    /// The texel at `along_m` (any value) and `across_m` (within the half width).
+    /// The texel at fixed-point places `along` (any) and `across` (from the left rim of the texture, below
+    /// [`ACROSS_UNITS`]).
     #[inline(always)]
-    pub fn fetch(&self, along_m: f32, across_m: f32) -> u32 {
-        let u = (along_m * self.along_per_m) as i32 as usize & self.along_mask;
-        let v = ((across_m + HALF_M) * self.across_per_m) as usize;
-        self.texels[(v << self.log2_along | u).min(self.texels.len() - 1)]
+    pub fn fetch(&self, along: i32, across: u32) -> u32 {
+        let u = (along >> self.along_shift) as usize & self.along_mask;
+        self.texels[u << self.log2_across | (across >> self.across_shift) as usize]
     }
 }
 
 impl RoadTexture {
-    /// Paints a look and all its averages.
-    pub fn paint(look: &Look, seed: u32) -> RoadTexture {
-        let mut level = Vec::with_capacity(SIZE * SIZE);
-        for v in 0..SIZE {
-            for u in 0..SIZE {
-                let along = (u as f32 + 0.5) * PERIOD_M / SIZE as f32;
-                let across = (v as f32 + 0.5) * 2.0 * HALF_M / SIZE as f32 - HALF_M;
-                level.push(paint_texel(look, along, across, seed));
-            }
-        }
+    /// Paints a look, seen in light of colour `sun` (1 = white), and all its averages.
+    pub fn paint(look: &Look, sun: [f32; 3], seed: u32) -> RoadTexture {
+        use rayon::prelude::*;
+        let texel = |at: usize| {
+            let along = ((at / SIZE) as f32 + 0.5) * PERIOD_M / SIZE as f32;
+            let across = ((at % SIZE) as f32 + 0.5) * 2.0 * HALF_M / SIZE as f32 - HALF_M;
+            paint_texel(look, along, across, sun, seed)
+        };
+        let mut level: Vec<u32> = (0..SIZE * SIZE).into_par_iter().map(texel).collect();
         let mut texels = Vec::with_capacity(4 * SIZE * SIZE);
         let mut offsets = [[0; LEVELS]; LEVELS];
-        for (j, row) in offsets.iter_mut().enumerate() {
-            let height = SIZE >> j;
+        for (i, row) in offsets.iter_mut().enumerate() {
             let mut narrow = level.clone();
-            for (i, offset) in row.iter_mut().enumerate() {
+            for offset in row.iter_mut() {
                 *offset = texels.len() as u32;
                 texels.extend_from_slice(&narrow);
-                if SIZE >> i > 1 {
-                    narrow = narrow.chunks_exact(2).map(|p| average(p[0], p[1])).collect();
-                }
+                narrow = narrow.chunks_exact(2).map(|p| average(p[0], p[1])).collect();
             }
-            if height > 1 {
+            if SIZE >> i > 1 {
                 level = level
                     .chunks_exact(2 * SIZE)
-                    .flat_map(|rows| (0..SIZE).map(move |u| average(rows[u], rows[SIZE + u])))
+                    .flat_map(|rows| (0..SIZE).map(move |v| average(rows[v], rows[SIZE + v])))
                     .collect();
             }
         }
@@ -82,14 +88,13 @@ impl RoadTexture {
     pub fn level(&self, along_m: f32, across_m: f32) -> Level<'_> {
         let i = log2_floor(along_m * (SIZE as f32 / PERIOD_M));
         let j = log2_floor(across_m * (SIZE as f32 / (2.0 * HALF_M)));
-        let (along, across) = (SIZE >> i, SIZE >> j);
-        let from = self.offsets[j][i] as usize;
+        let from = self.offsets[i][j] as usize;
         Level {
-            texels: &self.texels[from..from + along * across],
-            along_per_m: along as f32 / PERIOD_M,
-            across_per_m: across as f32 / (2.0 * HALF_M),
-            along_mask: along - 1,
-            log2_along: LOG2_SIZE - i as u32,
+            texels: &self.texels[from..from + (SIZE >> i) * (SIZE >> j)],
+            along_shift: FRACTION_BITS + i as u32,
+            across_shift: FRACTION_BITS + j as u32,
+            along_mask: (SIZE >> i) - 1,
+            log2_across: LOG2_SIZE - j as u32,
         }
     }
 }
@@ -97,7 +102,8 @@ impl RoadTexture {
 /// Logarithm to base 2, rounded down and kept within the levels, from the exponent bits of the number.
 #[inline(always)]
 fn log2_floor(x: f32) -> usize {
-    ((x.max(1.0).to_bits() >> 23) as usize - 127).min(LEVELS - 1)
+    let x = if x > 1.0 { x } else { 1.0 };
+    ((x.to_bits() >> 23) as usize - 127).min(LEVELS - 1)
 }
 
 /// Mean of two texels, byte by byte, rounded to even pairs.
@@ -131,7 +137,7 @@ fn grain(along: f32, across: f32, size_m: f32, stretch: f32, seed: u32) -> f32 {
     value_noise(along * cells / PERIOD_M, (across + HALF_M) / size_m, Some((cells as i32, wide as i32 + 1)), seed) - 0.5
 }
 
-fn paint_texel(look: &Look, along: f32, across: f32, seed: u32) -> u32 {
+fn paint_texel(look: &Look, along: f32, across: f32, sun: [f32; 3], seed: u32) -> u32 {
     let edge = if across < 0.0 { look.left } else { look.right };
     let out = across.abs() - HALF_ROAD_M;
     let mut rgb = surface(look, along, across, seed);
@@ -174,7 +180,8 @@ fn paint_texel(look: &Look, along: f32, across: f32, seed: u32) -> u32 {
     }
     let end = kerb_m + look.shoulder_m.min(HALF_M - HALF_ROAD_M - kerb_m - 0.05);
     let fringe = out + 0.5 * grain(along, across, 0.5, 1.0, seed + 9);
-    pack(rgb, 1.0 - smoothstep(end - 0.25, end, fringe))
+    let coloured = std::array::from_fn(|k| rgb[k] * lerp(1.0, sun[k], 0.8));
+    pack(coloured, 1.0 - smoothstep(end - 0.25, end, fringe))
 }
 
 fn surface(look: &Look, along: f32, across: f32, seed: u32) -> [f32; 3] {
@@ -233,28 +240,33 @@ mod tests {
         }
     }
 
-    #[test]
-    fn averages_keep_the_mean_colour_and_lines_survive_along_the_road() {
-        let texture = RoadTexture::paint(&look(), 1);
-        let red = |texel: u32| (texel & 255) as f32;
-        let fine = texture.level(0.01, 0.01);
-        let mean = |across: f32| (0..512).map(|u| red(fine.fetch(u as f32 * PERIOD_M / 512.0 + 0.01, across))).sum::<f32>() / 512.0;
-        // A pixel 24 m long but narrow still separates the line from the asphalt beside it.
-        let long = texture.level(30.0, 0.03);
-        assert!((red(long.fetch(3.0, 0.0)) - mean(0.0)).abs() < 6.0);
-        assert!(red(long.fetch(3.0, 0.0)) > red(long.fetch(3.0, 1.0)) + 40.0);
-        // Far away everything is one colour, whatever the place.
-        let far = texture.level(1e3, 1e3);
-        assert_eq!(far.fetch(0.3, -7.9), far.fetch(22.0, 7.9));
+    fn at(level: &Level, along_m: f32, across_m: f32) -> u32 {
+        level.fetch((along_m * ALONG_UNITS_PER_M) as i32, ((across_m + HALF_M) * ACROSS_UNITS_PER_M) as u32)
     }
 
     #[test]
-    fn the_land_shows_beyond_the_shoulder() {
-        let texture = RoadTexture::paint(&look(), 1);
+    fn averages_keep_the_mean_colour_and_lines_survive_along_the_road() {
+        let texture = RoadTexture::paint(&look(), [1.0; 3], 1);
+        let red = |texel: u32| (texel & 255) as f32;
+        let fine = texture.level(0.01, 0.01);
+        let mean = |across: f32| (0..512).map(|u| red(at(&fine, u as f32 * PERIOD_M / 512.0 + 0.01, across))).sum::<f32>() / 512.0;
+        // A pixel 24 m long but narrow still separates the line from the asphalt beside it.
+        let long = texture.level(30.0, 0.03);
+        assert!((red(at(&long, 3.0, 0.01)) - mean(0.01)).abs() < 6.0);
+        assert!(red(at(&long, 3.0, 0.01)) > red(at(&long, 3.0, 1.0)) + 40.0);
+        // Far away everything is one colour, whatever the place.
+        let far = texture.level(1e3, 1e3);
+        assert_eq!(at(&far, 0.3, -7.9), at(&far, 22.0, 7.9));
+    }
+
+    #[test]
+    fn the_land_shows_beyond_the_shoulder_and_the_pattern_repeats() {
+        let texture = RoadTexture::paint(&look(), [1.0; 3], 1);
         let fine = texture.level(0.01, 0.01);
         for along in [0.5, 7.0, 20.0] {
-            assert_eq!(fine.fetch(along, 0.5) >> 24, 255);
-            assert_eq!(fine.fetch(along, 7.5) >> 24, 0);
+            assert_eq!(at(&fine, along, 0.5) >> 24, 255);
+            assert_eq!(at(&fine, along, 7.5) >> 24, 0);
+            assert_eq!(at(&fine, along, 0.5), at(&fine, along + 3.0 * PERIOD_M, 0.5));
         }
     }
 }

@@ -2,6 +2,7 @@
 
 use super::math::{hash2, lerp, smoothstep, value_noise};
 use super::road_texture::pack;
+use super::terrain::clip;
 use super::track::Track;
 
 /// Texels around the horizon; a power of two.
@@ -64,7 +65,7 @@ impl Sky {
     #[inline(always)]
     pub fn fetch(&self, around: f32, tangent: f32) -> u32 {
         let i = (around as i32) as usize & (AROUND - 1);
-        let j = ((tangent - LOWEST) * PER_TANGENT).clamp(0.0, UP as f32 - 1.0) as usize;
+        let j = clip((tangent - LOWEST) * PER_TANGENT, UP as f32 - 1.0) as i32 as usize;
         self.texels[j * AROUND + i]
     }
 }

@@ -143,11 +143,9 @@ impl Terrain {
     /// Height of the land at grid coordinates (metres east and north of the grid's corner), interpolated.
     #[inline(always)]
     pub fn height_at_grid(&self, gx: f32, gy: f32) -> f32 {
-        let gx = gx.clamp(0.0, self.nx as f32 - 1.001);
-        let gy = gy.clamp(0.0, self.ny as f32 - 1.001);
-        let (i, j) = (gx as i32, gy as i32);
-        let (fx, fy) = (gx - i as f32, gy - j as f32);
-        let from = j as usize * self.nx + i as usize;
+        let (i, fx) = split(clip(gx, self.nx as f32 - 1.01));
+        let (j, fy) = split(clip(gy, self.ny as f32 - 1.01));
+        let from = j * self.nx + i;
         let (low, high) = (&self.heights[from..from + 2], &self.heights[from + self.nx..from + self.nx + 2]);
         let a = low[0] + (low[1] - low[0]) * fx;
         let b = high[0] + (high[1] - high[0]) * fx;
@@ -159,12 +157,12 @@ impl Terrain {
         self.height_at_grid(x - self.x0, y - self.y0)
     }
 
-    /// The station nearest to grid coordinates, or [`NO_STATION`].
+    /// The station nearest to grid coordinates within the grid, or [`NO_STATION`].
     #[inline(always)]
     pub fn station_at_grid(&self, gx: f32, gy: f32) -> u16 {
-        let i = (gx.max(0.0) + 0.5) as usize;
-        let j = (gy.max(0.0) + 0.5) as usize;
-        if i < self.nx && j < self.ny { self.stations[j * self.nx + i] } else { NO_STATION }
+        let (i, _) = split(clip(gx + 0.5, self.nx as f32 - 1.01));
+        let (j, _) = split(clip(gy + 0.5, self.ny as f32 - 1.01));
+        self.stations[j * self.nx + i]
     }
 
     /// Unit normal of the land at a point of the grid.
@@ -368,32 +366,71 @@ impl GroundMap {
         GroundMap { levels }
     }
 
-    /// The level for a pixel that covers about `size_m` of ground.
+    /// The level for a pixel that covers `area_m2` of ground.
     #[inline(always)]
-    pub fn level(&self, size_m: f32) -> GroundLevel<'_> {
-        let k = (((size_m * 2.0).max(1.0).to_bits() >> 23) as usize - 127).min(self.levels.len() - 1);
-        let (texels, nx, ny) = &self.levels[k];
-        GroundLevel { texels, nx: *nx, ny: *ny, per_m: 2.0 / (1 << k) as f32 }
+    pub fn level(&self, area_m2: f32) -> GroundLevel<'_> {
+        // The side of a square of that area in finest texels, as a power of two: half the exponent of the area.
+        let area = clip(area_m2 * 4.0 - 1.0, 1e6) + 1.0;
+        let k = (((area.to_bits() >> 23) as usize - 127) / 2).min(self.levels.len() - 1);
+        let (texels, nx, _) = &self.levels[k];
+        GroundLevel { texels, nx: *nx, shift: GROUND_FRACTION_BITS + k as u32 }
+    }
+
+    /// Light (alpha, 0 to 255) at grid coordinates, interpolated.
+    #[inline(always)]
+    pub fn light(&self, gx: f32, gy: f32) -> f32 {
+        let (texels, nx, ny) = &self.levels[0];
+        let (i, fx) = split(clip(2.0 * gx - 0.5, *nx as f32 - 1.01));
+        let (j, fy) = split(clip(2.0 * gy - 0.5, *ny as f32 - 1.01));
+        let from = j * nx + i;
+        let (low, high) = (&texels[from..from + 2], &texels[from + nx..from + nx + 2]);
+        let alpha = |t: u32| (t >> 24) as i32 as f32;
+        let a = lerp(alpha(low[0]), alpha(low[1]), fx);
+        let b = lerp(alpha(high[0]), alpha(high[1]), fx);
+        lerp(a, b, fy)
     }
 }
+
+/// Bits behind the point of fixed-point places on the map; the unit is the finest texel of 0.5 m.
+pub const GROUND_FRACTION_BITS: u32 = 12;
+/// Fixed-point units for each metre.
+pub const GROUND_UNITS_PER_M: f32 = (2 << GROUND_FRACTION_BITS) as f32;
 
 /// One level of a [`GroundMap`].
 #[derive(Clone, Copy)]
 pub struct GroundLevel<'a> {
     texels: &'a [u32],
     nx: usize,
-    ny: usize,
-    per_m: f32,
+    shift: u32,
 }
 
 impl GroundLevel<'_> {
-    /// The texel at grid coordinates, m.
+    /// The texel at a fixed-point place within the grid.
     #[inline(always)]
-    pub fn fetch(&self, gx: f32, gy: f32) -> u32 {
-        let i = ((gx * self.per_m) as i32).max(0) as usize;
-        let j = ((gy * self.per_m) as i32).max(0) as usize;
-        self.texels[j.min(self.ny - 1) * self.nx + i.min(self.nx - 1)]
+    pub fn fetch(&self, x: i32, y: i32) -> u32 {
+        let at = (y >> self.shift) as usize * self.nx + (x >> self.shift) as usize;
+        // The rim of the land may be missing from coarse levels when the size is odd.
+        self.texels[at.min(self.texels.len() - 1)]
     }
+}
+
+/// Brings `x` into [0, high]; the form of the comparisons compiles to two instructions.
+#[inline(always)]
+pub fn clip(x: f32, high: f32) -> f32 {
+    let x = if x > 0.0 { x } else { 0.0 };
+    if x < high { x } else { high }
+}
+
+/// Whole part and rest of a number in [0, 2^22).
+///
+/// Adding 2^23 leaves the rounded number in the low bits of the mantissa, which is much faster than a checked cast; the
+/// further 2 keep 0 - 0.5 above 2^23. Where the number is whole, the result may be one less with a rest of 1.
+#[inline(always)]
+fn split(x: f32) -> (usize, f32) {
+    const MAGIC: f32 = 8_388_610.0;
+    let moved = (x - 0.5) + MAGIC;
+    let whole = (moved.to_bits() & 0x007f_ffff) as usize - 2;
+    (whole, x - (moved - MAGIC))
 }
 
 fn mean4(a: u32, b: u32, c: u32, d: u32) -> u32 {

@@ -84,8 +84,6 @@ pub struct World {
     pub haze: [f32; 3],
     /// Distance at which air hides half, m.
     pub haze_m: f32,
-    /// Light on the road, as a colour.
-    pub sun: [f32; 3],
 }
 
 impl World {
@@ -98,6 +96,7 @@ impl World {
             let (sin_e, cos_e) = sin_cos(light.sun_elevation_deg.clamp(5.0, 85.0).to_radians());
             vec3((cos_a * cos_e) as f32, (sin_a * cos_e) as f32, sin_e as f32)
         };
+        let sunlight = light.sun.map(|c| f32::from(c) / 255.0);
         let lit = terrain.lit(sun, light.shade);
         let mut scenery = Scenery::new(track, &terrain, &lit);
         scenery.plant();
@@ -111,14 +110,13 @@ impl World {
             ground,
             road: road_cells(track, &terrain, road_length_m),
             road_length_m,
-            textures: track.spec.look.iter().zip(1..).map(|(l, k)| RoadTexture::paint(l, land.seed * 31 + 97 * k)).collect(),
+            textures: track.spec.look.iter().zip(1..).map(|(l, k)| RoadTexture::paint(l, sunlight, land.seed * 31 + 97 * k)).collect(),
             sprites: scenery.sprites,
             pictures: scenery.pictures,
             walls,
             sky: Sky::paint(track),
             haze: light.horizon.map(f32::from),
             haze_m: light.haze_m,
-            sun: light.sun.map(|c| f32::from(c) / 255.0),
             terrain,
         }
     }
