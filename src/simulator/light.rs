@@ -33,7 +33,9 @@ impl Variant {
             (256.0 * (0.88 + (light - 1.0) * 0.88 * depth) * road).clamp(20.0, 256.0) as u16
         });
         let tone = tint.map(|tint| {
-            std::array::from_fn(|v| (((v as f32 - 110.0) * contrast + 110.0) * gain * tint + 0.5).clamp(0.0, 255.0) as u8)
+            std::array::from_fn(|v| {
+                (((v as f32 - 110.0) * contrast + 110.0) * gain * tint + 0.5).clamp(0.0, 255.0) as u8
+            })
         });
         Variant { road_shift_m, road_light, haze: pack(world.haze, 0.0), tone }
     }

@@ -72,9 +72,14 @@ pub fn sin_cos(angle: f64) -> (f64, f64) {
     let quarter = (angle / FRAC_PI_2).round();
     let x = angle - quarter * FRAC_PI_2;
     let y = x * x;
-    let sin = x * (1.0 - y / 6.0 * (1.0 - y / 20.0 * (1.0 - y / 42.0 * (1.0 - y / 72.0 * (1.0 - y / 110.0 * (1.0 - y / 156.0))))));
+    let sin = x
+        * (1.0
+            - y / 6.0 * (1.0 - y / 20.0 * (1.0 - y / 42.0 * (1.0 - y / 72.0 * (1.0 - y / 110.0 * (1.0 - y / 156.0))))));
     let cos = 1.0
-        - y / 2.0 * (1.0 - y / 12.0 * (1.0 - y / 30.0 * (1.0 - y / 56.0 * (1.0 - y / 90.0 * (1.0 - y / 132.0 * (1.0 - y / 182.0))))));
+        - y / 2.0
+            * (1.0
+                - y / 12.0
+                    * (1.0 - y / 30.0 * (1.0 - y / 56.0 * (1.0 - y / 90.0 * (1.0 - y / 132.0 * (1.0 - y / 182.0))))));
     match (quarter as i64).rem_euclid(4) {
         0 => (sin, cos),
         1 => (cos, -sin),
@@ -107,7 +112,13 @@ pub fn atan(x: f64) -> f64 {
 pub fn atan2(y: f64, x: f64) -> f64 {
     use std::f64::consts::{FRAC_PI_2, PI};
     if x.abs() >= y.abs() {
-        let turn = if x >= 0.0 { 0.0 } else if y >= 0.0 { PI } else { -PI };
+        let turn = if x >= 0.0 {
+            0.0
+        } else if y >= 0.0 {
+            PI
+        } else {
+            -PI
+        };
         if x == 0.0 { 0.0 } else { atan(y / x) + turn }
     } else {
         FRAC_PI_2.copysign(y) - atan(x / y)
@@ -220,7 +231,8 @@ mod tests {
 
     #[test]
     fn random_streams_are_repeatable_and_distinct() {
-        let draw = |seed, name| (0..4).map(|_| 0).scan(Rng::new(seed, name), |r, _| Some(r.next_u64())).collect::<Vec<_>>();
+        let draw =
+            |seed, name| (0..4).map(|_| 0).scan(Rng::new(seed, name), |r, _| Some(r.next_u64())).collect::<Vec<_>>();
         assert_eq!(draw(1, "start"), draw(1, "start"));
         assert_ne!(draw(1, "start"), draw(2, "start"));
         assert_ne!(draw(1, "start"), draw(1, "light"));

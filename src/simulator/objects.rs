@@ -118,7 +118,8 @@ fn draw_wall(depths: &mut [f32], view: &View, piece: &WallPiece, frame: &mut Rgb
         let t = (NEAREST_M - b.z) / (a.z - b.z);
         (b, along_b) = (b + (a - b) * t, length * (1.0 - t));
     }
-    let screen = |p: Vec3| (WIDTH as f32 / 2.0 + p.x / p.z * FOCAL_PX, HEIGHT as f32 / 2.0 - p.y / p.z * FOCAL_PX, 1.0 / p.z);
+    let screen =
+        |p: Vec3| (WIDTH as f32 / 2.0 + p.x / p.z * FOCAL_PX, HEIGHT as f32 / 2.0 - p.y / p.z * FOCAL_PX, 1.0 / p.z);
     let (mut from, mut to) = ((screen(a), along_a), (screen(b), along_b));
     if from.0.0 > to.0.0 {
         std::mem::swap(&mut from, &mut to);

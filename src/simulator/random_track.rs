@@ -84,11 +84,13 @@ fn pick<T: Copy>(rng: &mut Rng, of: &[T]) -> T {
 
 fn look(rng: &mut Rng, name: &str, centre: Centre) -> Look {
     let surface = pick(rng, &[Surface::Asphalt, Surface::Asphalt, Surface::Patched, Surface::Patched, Surface::Cobble]);
-    let base = pick(rng, &[[112, 110, 106], [84, 84, 86], [138, 134, 128], [136, 118, 102], [104, 92, 84], [160, 154, 144]]);
+    let base =
+        pick(rng, &[[112, 110, 106], [84, 84, 86], [138, 134, 128], [136, 118, 102], [104, 92, 84], [160, 154, 144]]);
     let edges = [Edge::White, Edge::Yellow, Edge::YellowKerbstone, Edge::Kerb, Edge::Bare, Edge::Bare];
     let left = pick(rng, &edges);
     let right = if rng.unit() < 0.7 { left } else { pick(rng, &edges) };
-    let soil = pick(rng, &[[120, 112, 70], [150, 112, 76], [96, 104, 58], [176, 160, 120], [110, 104, 96], [88, 78, 58]]);
+    let soil =
+        pick(rng, &[[120, 112, 70], [150, 112, 76], [96, 104, 58], [176, 160, 120], [110, 104, 96], [88, 78, 58]]);
     Look {
         name: name.to_string(),
         surface,
@@ -168,7 +170,8 @@ fn stretches(rng: &mut Rng, lap_m: f64, spec: &TrackSpec) -> Vec<Stretch> {
     while from_m < lap_m - 30.0 {
         let to_m = (from_m + rng.between(60.0, 180.0)).min(lap_m);
         let mut side = || {
-            let side = pick(rng, &[Side::Flat, Side::Flat, Side::Hill, Side::Hill, Side::Cliff, Side::Drop, Side::Water]);
+            let side =
+                pick(rng, &[Side::Flat, Side::Flat, Side::Hill, Side::Hill, Side::Cliff, Side::Drop, Side::Water]);
             if side == Side::Water && !water { Side::Drop } else { side }
         };
         let (left, right) = (side(), side());

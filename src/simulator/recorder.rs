@@ -146,7 +146,8 @@ impl Session<'_> {
                 return;
             }
             let due = step % (STEPS_PER_S / RECORD_HZ) == 0;
-            let before = due.then(|| (self.simulation.time_s(), self.simulation.body_pose(), self.simulation.car.speed_mps));
+            let before =
+                due.then(|| (self.simulation.time_s(), self.simulation.body_pose(), self.simulation.car.speed_mps));
             let driven = self.step();
             if let Some((time_s, body, speed_mps)) = before {
                 samples.push(self.sample(time_s, driven, body, speed_mps));
@@ -271,13 +272,16 @@ pub fn write_recording(
 }
 
 /// Creates `out` with its parents; refuses one that exists.
-fn create_new_folder(out: &Path) -> Result<()> {
+pub(super) fn create_new_folder(out: &Path) -> Result<()> {
     if let Some(parent) = out.parent().filter(|p| !p.as_os_str().is_empty()) {
         fs::create_dir_all(parent).map_err(Error::io(parent))?;
     }
     fs::create_dir(out).map_err(|source| {
         if source.kind() == io::ErrorKind::AlreadyExists {
-            Error::Usage(format!("{}: exists already and is not overwritten; name a new folder or remove it", out.display()))
+            Error::Usage(format!(
+                "{}: exists already and is not overwritten; name a new folder or remove it",
+                out.display()
+            ))
         } else {
             Error::Io { path: out.to_path_buf(), source }
         }
@@ -309,7 +313,8 @@ fn write_log(log: &Path, samples: &[Sample], format: LogFormat) -> io::Result<()
                 LogFormat::V2 => write!(text, "{}{separator}", folder.join(name).display())?,
             }
         }
-        let numbers = [sample.steering, sample.throttle, sample.brake, sample.speed_mph].map(|v| (v as f32).to_string());
+        let numbers =
+            [sample.steering, sample.throttle, sample.brake, sample.speed_mph].map(|v| (v as f32).to_string());
         writeln!(text, "{}", numbers.join(separator))?;
     }
     fs::write(log, text)
@@ -344,7 +349,8 @@ mod tests {
         let smooth = drive_expert(&track, &RecordOptions::default());
         assert!(recovery.len() > 300 && spread(&recovery) > 1.5 * spread(&smooth));
         let keys = drive_expert(&track, &RecordOptions { style: Style::Keyboard, ..Default::default() });
-        let zero = |samples: &[Sample]| samples.iter().filter(|s| s.steering == 0.0).count() as f64 / samples.len() as f64;
+        let zero =
+            |samples: &[Sample]| samples.iter().filter(|s| s.steering == 0.0).count() as f64 / samples.len() as f64;
         assert!(zero(&keys) > 0.4 && zero(&smooth) < 0.05, "{} {}", zero(&keys), zero(&smooth));
     }
 }

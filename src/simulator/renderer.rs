@@ -41,11 +41,7 @@ pub struct Renderer {
 
 impl Default for Renderer {
     fn default() -> Self {
-        Renderer {
-            anchors: vec![0.0; HEIGHT * ANCHORS],
-            depths: vec![0.0; HEIGHT * WIDTH],
-            bonnet: Bonnet::default(),
-        }
+        Renderer { anchors: vec![0.0; HEIGHT * ANCHORS], depths: vec![0.0; HEIGHT * WIDTH], bonnet: Bonnet::default() }
     }
 }
 
@@ -110,7 +106,11 @@ impl Renderer {
             let ray = camera.ray(column, HEIGHT as f32 / 2.0);
             let sky = camera.ray(column, 30.0);
             let turn = atan2(f64::from(sky.y), f64::from(sky.x)) / std::f64::consts::TAU;
-            Column { middle: ray, level: 1.0 / (ray.x * ray.x + ray.y * ray.y).sqrt(), turn: turn as f32 * AROUND as f32 }
+            Column {
+                middle: ray,
+                level: 1.0 / (ray.x * ray.x + ray.y * ray.y).sqrt(),
+                turn: turn as f32 * AROUND as f32,
+            }
         });
         let limit = (world.terrain.nx as f32 - 1.01, world.terrain.ny as f32 - 1.01);
         let view = View { world, variant, camera, eye, limit, columns };
@@ -121,6 +121,11 @@ impl Renderer {
         self.shade(&view, frame);
         objects::draw(&mut self.depths, &view, frame);
         self.bonnet.draw(mount, variant, frame);
+    }
+
+    /// Depth along the camera's axis at a pixel of the last picture, m; infinite for the sky.
+    pub fn depth_m(&self, column: usize, row: usize) -> f32 {
+        1.0 / self.depths[row * WIDTH + column]
     }
 
     fn march_column(&mut self, view: &View, k: usize) {
@@ -256,7 +261,13 @@ impl View<'_> {
         }
         let length = (self.world.road_length_m * ALONG_UNITS_PER_M) as i32;
         let way = b.along - a.along;
-        let lap = if way > length / 2 { -length } else if way < -length / 2 { length } else { 0 };
+        let lap = if way > length / 2 {
+            -length
+        } else if way < -length / 2 {
+            length
+        } else {
+            0
+        };
         let limit = ((1.5 + 0.6 * a.depth) * ACROSS_UNITS_PER_M) as i32;
         ((way + lap).abs() < limit && (b.across - a.across).abs() < limit).then_some(lap)
     }

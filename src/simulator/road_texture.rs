@@ -168,7 +168,9 @@ fn paint_texel(look: &Look, along: f32, across: f32, sun: [f32; 3], seed: u32) -
         _ => (0.0, [0.0; 3]),
     };
     let ragged = match edge {
-        Edge::Overgrown => 1.1 * grain(along, across, 0.7, 1.0, seed + 7) + 0.5 * grain(along, across, 0.12, 1.0, seed + 8),
+        Edge::Overgrown => {
+            1.1 * grain(along, across, 0.7, 1.0, seed + 7) + 0.5 * grain(along, across, 0.12, 1.0, seed + 8)
+        }
         Edge::Bare | Edge::White => 0.3 * grain(along, across, 0.4, 1.0, seed + 7),
         _ => 0.0,
     };
@@ -249,7 +251,9 @@ mod tests {
         let texture = RoadTexture::paint(&look(), [1.0; 3], 1);
         let red = |texel: u32| (texel & 255) as f32;
         let fine = texture.level(0.01, 0.01);
-        let mean = |across: f32| (0..512).map(|u| red(at(&fine, u as f32 * PERIOD_M / 512.0 + 0.01, across))).sum::<f32>() / 512.0;
+        let mean = |across: f32| {
+            (0..512).map(|u| red(at(&fine, u as f32 * PERIOD_M / 512.0 + 0.01, across))).sum::<f32>() / 512.0
+        };
         // A pixel 24 m long but narrow still separates the line from the asphalt beside it.
         let long = texture.level(30.0, 0.03);
         assert!((red(at(&long, 3.0, 0.01)) - mean(0.01)).abs() < 6.0);

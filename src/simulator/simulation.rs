@@ -152,12 +152,21 @@ impl<'a> Simulation<'a> {
         let gx = s.slope * s.tx - s.crossfall * s.ty;
         let gy = s.slope * s.ty + s.crossfall * s.tx;
         let plane = s.z - s.crossfall * offset.clamp(-s.width_m, s.width_m);
-        let land = f64::from(self.track.world().terrain.height(self.car.x as f32, self.car.y as f32));
-        let z = if offset.abs() > s.width_m / 2.0 { plane.max(land) } else { plane };
+        let z = if offset.abs() > s.width_m / 2.0 {
+            let land = self.track.world().terrain.height(self.car.x as f32, self.car.y as f32);
+            plane.max(f64::from(land))
+        } else {
+            plane
+        };
         let (hx, hy) = (self.car.hx, self.car.hy);
         let forward = vec3(hx as f32, hy as f32, (gx * hx + gy * hy) as f32).unit();
         let right = forward.cross(vec3(-gx as f32, -gy as f32, 1.0)).unit();
-        BodyPose { origin: vec3(self.car.x as f32, self.car.y as f32, z as f32), forward, right, up: right.cross(forward) }
+        BodyPose {
+            origin: vec3(self.car.x as f32, self.car.y as f32, z as f32),
+            forward,
+            right,
+            up: right.cross(forward),
+        }
     }
 }
 
@@ -166,13 +175,7 @@ fn placed(track: &Track, start: Start, speed_mps: f64) -> Car {
     let sign = if start.reverse { -1.0 } else { 1.0 };
     let (tx, ty) = (s.tx * sign, s.ty * sign);
     let (sin, cos) = sin_cos(-start.heading_deg.to_radians());
-    Car::new(
-        s.x + ty * start.offset_m,
-        s.y - tx * start.offset_m,
-        tx * cos - ty * sin,
-        tx * sin + ty * cos,
-        speed_mps,
-    )
+    Car::new(s.x + ty * start.offset_m, s.y - tx * start.offset_m, tx * cos - ty * sin, tx * sin + ty * cos, speed_mps)
 }
 
 #[cfg(test)]
@@ -194,9 +197,8 @@ mod tests {
     #[test]
     fn wheels_leave_the_road_one_pair_at_a_time_and_walls_are_felt() {
         let track = Track::load("lake").unwrap();
-        let at = |s_m, offset_m| {
-            Simulation::new(&track, Start { s_m, reverse: false, offset_m, heading_deg: 0.0 }, 8.0)
-        };
+        let at =
+            |s_m, offset_m| Simulation::new(&track, Start { s_m, reverse: false, offset_m, heading_deg: 0.0 }, 8.0);
         assert_eq!(at(100.0, 4.3).wheels_off, 2);
         assert_eq!(at(100.0, -6.3).wheels_off, 4);
         assert!(!at(100.0, 4.3).at_wall);

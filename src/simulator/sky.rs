@@ -29,7 +29,14 @@ impl Sky {
         for i in 0..AROUND {
             // Two ranges of hills; the nearer one is wooded.
             let ridge = |cells: i32, seed: u32| {
-                let at = |k: i32| value_noise(i as f32 * (cells * k) as f32 / AROUND as f32, 0.5, Some((cells * k, 2)), land.seed + seed + k as u32);
+                let at = |k: i32| {
+                    value_noise(
+                        i as f32 * (cells * k) as f32 / AROUND as f32,
+                        0.5,
+                        Some((cells * k, 2)),
+                        land.seed + seed + k as u32,
+                    )
+                };
                 0.6 * at(1) + 0.28 * at(3) + 0.12 * at(9)
             };
             let scale = land.hills_m / 45.0;

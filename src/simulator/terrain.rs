@@ -324,10 +324,12 @@ impl GroundMap {
                 let tufts = value_noise(gx / 1.3, gy / 1.3, None, land.seed + 11);
                 let grain = hash2(i as i32, j as i32, land.seed + 12);
                 let mixing = smoothstep(0.3, 0.7, patches * 0.7 + tufts * 0.3);
-                let mut rgb: [f32; 3] = std::array::from_fn(|k| lerp(tone(land.ground[0])[k], tone(land.ground[1])[k], mixing));
+                let mut rgb: [f32; 3] =
+                    std::array::from_fn(|k| lerp(tone(land.ground[0])[k], tone(land.ground[1])[k], mixing));
                 let steep = smoothstep(0.86, 0.62, up + 0.14 * (tufts - 0.5));
                 let shade = 0.78 + 0.28 * tufts + 0.18 * grain;
-                let rocky = 0.6 + 0.55 * value_noise(gx / 2.1, height / 1.4 + gy / 5.0, None, land.seed + 13) + 0.2 * grain;
+                let rocky =
+                    0.6 + 0.55 * value_noise(gx / 2.1, height / 1.4 + gy / 5.0, None, land.seed + 13) + 0.2 * grain;
                 let mut glare = 1.0;
                 for (k, c) in rgb.iter_mut().enumerate() {
                     *c = lerp(*c * shade, tone(land.rock)[k] * rocky, steep);
@@ -346,7 +348,8 @@ impl GroundMap {
                     }
                 }
                 let bright = lerp(1.0, brightness, glare);
-                let coloured: [f32; 3] = std::array::from_fn(|k| rgb[k] * bright * lerp(1.0, f32::from(light.sun[k]) / 255.0, glare));
+                let coloured: [f32; 3] =
+                    std::array::from_fn(|k| rgb[k] * bright * lerp(1.0, f32::from(light.sun[k]) / 255.0, glare));
                 *texel = pack(coloured, bright * FULL_LIGHT / 255.0);
             }
         });
@@ -435,6 +438,7 @@ fn split(x: f32) -> (usize, f32) {
 
 fn mean4(a: u32, b: u32, c: u32, d: u32) -> u32 {
     const LOW: u32 = 0x00ff_00ff;
-    let part = |k: u32| (((a >> k) & LOW) + ((b >> k) & LOW) + ((c >> k) & LOW) + ((d >> k) & LOW) + 0x0002_0002) >> 2 & LOW;
+    let part =
+        |k: u32| (((a >> k) & LOW) + ((b >> k) & LOW) + ((c >> k) & LOW) + ((d >> k) & LOW) + 0x0002_0002) >> 2 & LOW;
     part(0) | part(8) << 8
 }

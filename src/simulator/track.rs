@@ -72,9 +72,9 @@ impl Track {
     /// [`from_spec`](Track::from_spec).
     pub fn load(name: &str) -> Result<Track> {
         if let Some(seed) = name.strip_prefix("random:") {
-            let seed = seed
-                .parse()
-                .map_err(|_| Error::Usage(format!("track `{name}`: `{seed}` is no seed; write for example random:7")))?;
+            let seed = seed.parse().map_err(|_| {
+                Error::Usage(format!("track `{name}`: `{seed}` is no seed; write for example random:7"))
+            })?;
             return random_track::generate(seed);
         }
         if let Some(text) = builtin::text(name) {
@@ -85,7 +85,8 @@ impl Track {
             return Track::from_toml(&text, name);
         }
         let known = builtin::names().collect::<Vec<_>>();
-        let nearest = known.iter().max_by(|a, b| strsim::jaro_winkler(name, a).total_cmp(&strsim::jaro_winkler(name, b)));
+        let nearest =
+            known.iter().max_by(|a, b| strsim::jaro_winkler(name, a).total_cmp(&strsim::jaro_winkler(name, b)));
         Err(Error::Usage(format!(
             "unknown track `{name}`; did you mean `{}`? Known: {}, random:SEED, or a path ending in .toml",
             nearest.unwrap_or(&"lake"),
@@ -142,7 +143,9 @@ impl Track {
             let at = self.s_of(i);
             let message = if station.curvature.abs() * smallest > 1.0 {
                 let radius = 1.0 / station.curvature.abs();
-                format!("radius {radius:.1} m at {at:.0} m of the lap; at least {smallest:.0} m, so spread the points there")
+                format!(
+                    "radius {radius:.1} m at {at:.0} m of the lap; at least {smallest:.0} m, so spread the points there"
+                )
             } else if station.slope.abs() > 0.2 {
                 format!("slope {:.0} % at {at:.0} m of the lap; at most 20 %", station.slope * 100.0)
             } else if !(5.0..=14.0).contains(&station.width_m) {
@@ -265,7 +268,10 @@ impl Track {
         let h = self.spacing_m();
         let (t2, t3) = (t * t, t * t * t);
         let curve = |p: f64, dp: f64, q: f64, dq: f64| {
-            p * (2.0 * t3 - 3.0 * t2 + 1.0) + dp * h * (t3 - 2.0 * t2 + t) + q * (3.0 * t2 - 2.0 * t3) + dq * h * (t3 - t2)
+            p * (2.0 * t3 - 3.0 * t2 + 1.0)
+                + dp * h * (t3 - 2.0 * t2 + t)
+                + q * (3.0 * t2 - 2.0 * t3)
+                + dq * h * (t3 - t2)
         };
         let (tx, ty) = (mix(a.tx, b.tx), mix(a.ty, b.ty));
         let norm = 1.0 / (tx * tx + ty * ty).sqrt();

@@ -110,7 +110,13 @@ impl World {
             ground,
             road: road_cells(track, &terrain, road_length_m),
             road_length_m,
-            textures: track.spec.look.iter().zip(1..).map(|(l, k)| RoadTexture::paint(l, sunlight, land.seed * 31 + 97 * k)).collect(),
+            textures: track
+                .spec
+                .look
+                .iter()
+                .zip(1..)
+                .map(|(l, k)| RoadTexture::paint(l, sunlight, land.seed * 31 + 97 * k))
+                .collect(),
             sprites: scenery.sprites,
             pictures: scenery.pictures,
             walls,
@@ -239,7 +245,10 @@ impl<'a> Scenery<'a> {
                 (s.x + s.ty * d, s.y - s.tx * d)
             } else {
                 let (nx, ny) = (self.terrain.nx as f64, self.terrain.ny as f64);
-                (f64::from(self.terrain.x0) + rng.between(2.0, nx - 2.0), f64::from(self.terrain.y0) + rng.between(2.0, ny - 2.0))
+                (
+                    f64::from(self.terrain.x0) + rng.between(2.0, nx - 2.0),
+                    f64::from(self.terrain.y0) + rng.between(2.0, ny - 2.0),
+                )
             };
             let plant = land.plants[rng.below(land.plants.len())];
             let (variant, scale, mirrored) = (rng.below(VARIANTS), rng.between(0.7, 1.25), rng.unit() < 0.5);
