@@ -15,9 +15,13 @@ const LOOK_AHEAD_S: f64 = 0.35;
 /// distance `l` under the angle `a` has curvature `2 sin(a) / l`; the front wheels that follow it stand at
 /// `atan(wheelbase * 2 sin(a) / l)`.
 pub fn pursuit(simulation: &Simulation) -> f64 {
+    pursue(simulation, LOOK_AHEAD_M + LOOK_AHEAD_S * simulation.car.speed_mps)
+}
+
+/// Pursuit of the point `ahead` m from the rear axle.
+fn pursue(simulation: &Simulation, ahead: f64) -> f64 {
     let (track, car) = (simulation.track, &simulation.car);
     let sign = if simulation.reverse { -1.0 } else { 1.0 };
-    let ahead = LOOK_AHEAD_M + LOOK_AHEAD_S * car.speed_mps;
     let target = track.at(simulation.location.s_m + sign * (ahead - REAR_AXLE_M));
     let (dx, dy) = (target.x - (car.x - REAR_AXLE_M * car.hx), target.y - (car.y - REAR_AXLE_M * car.hy));
     let square = (dx * dx + dy * dy).max(1.0);
@@ -26,6 +30,11 @@ pub fn pursuit(simulation: &Simulation) -> f64 {
     let wheels = atan(WHEELBASE_M * 2.0 * right / square);
     (wheels.to_degrees() / MAX_STEER_DEG).clamp(-1.0, 1.0)
 }
+
+/// Steering too small for a key press.
+const TOLERATED: f64 = 0.05;
+/// Distance that the driver with keys looks ahead, m.
+const KEYBOARD_LOOK_AHEAD_M: f64 = 11.0;
 
 /// How the expert moves the wheel.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -49,8 +58,16 @@ pub struct Keyboard {
 }
 
 impl Keyboard {
-    /// The wheel after one step of 20 ms in which `wanted` steering was called for.
-    pub fn step(&mut self, wanted: f64) -> f64 {
+    /// The wheel after one more step of 20 ms on the way of `simulation`.
+    pub fn steer(&mut self, simulation: &Simulation) -> f64 {
+        // Who cannot steer finely looks farther ahead.
+        self.step(pursue(simulation, KEYBOARD_LOOK_AHEAD_M))
+    }
+
+    /// The wheel after one step in which `wanted` steering was called for.
+    fn step(&mut self, wanted: f64) -> f64 {
+        // A little error is not worth a key.
+        let wanted = if wanted.abs() < TOLERATED { 0.0 } else { wanted };
         self.missing = (self.missing + (wanted - self.wheel) * STEP_S).clamp(-0.2, 0.2);
         if self.pressed == 0.0 && self.missing.abs() > 0.022 {
             self.pressed = self.missing.signum();

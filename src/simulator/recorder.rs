@@ -126,8 +126,10 @@ struct Session<'a> {
 impl Session<'_> {
     /// Drives one step; returns the label and the throttle that were in force.
     fn step(&mut self) -> (f64, f64) {
-        let wanted = pursuit(&self.simulation);
-        let steering = self.keyboard.as_mut().map_or(wanted, |k| k.step(wanted));
+        let steering = match &mut self.keyboard {
+            Some(keyboard) => keyboard.steer(&self.simulation),
+            None => pursuit(&self.simulation),
+        };
         let throttle = self.speed.throttle(self.target_mph, self.simulation.car.speed_mps / MPS_PER_MPH, STEP_S);
         let disturbed = steering + self.noise.next(STEP_S);
         self.simulation.step(Controls { steering: disturbed, throttle });
