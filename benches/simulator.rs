@@ -5,8 +5,8 @@ use std::hint::black_box;
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use steersman::simulator::run::run;
 use steersman::simulator::{
-    Camera, DriveState, Driver, Expert, Mount, Renderer, RgbFrame, RunOptions, Simulation, Speed, Start, Track, Variant,
-    jpeg,
+    Camera, DriveState, Driver, Expert, Mount, Renderer, RgbFrame, RunOptions, Simulation, Speed, Start, Track,
+    Variant, jpeg,
 };
 
 /// Cameras all around a lap, so that every kind of view is in the mean.

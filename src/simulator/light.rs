@@ -27,7 +27,7 @@ impl Variant {
         let tint = [0; 3].map(|_| 1.0 + around(0.05));
         let road = 1.0 + around(0.12);
         let depth = 1.0 + around(0.25);
-        let road_shift_m = 64.0 * 24.0 + 12.0 * (1.0 + around(1.0));
+        let road_shift_m = 24.0 + 12.0 * (1.0 + around(1.0));
         let road_light = std::array::from_fn(|a| {
             let light = a as f32 / super::terrain::FULL_LIGHT;
             (256.0 * (0.88 + (light - 1.0) * 0.88 * depth) * road).clamp(20.0, 256.0) as u16

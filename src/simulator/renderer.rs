@@ -2,10 +2,10 @@
 //!
 //! A picture is made in four passes, none of which calls a function of the mathematical library for a pixel:
 //!
-//! 1. *March*: in every fourth column, from the bottom up, the ray of each pixel is followed over the land until it goes
+//! 1. *March*: in every eighth column, from the bottom up, the ray of each pixel is followed over the land until it goes
 //!    below it. A ray is never blocked nearer than the ray below it, so each search starts where the last one ended, and a
 //!    crest hides what is behind it.
-//! 2. *Shade*: along each row the place on the land is interpolated between these columns (four pixels at a time) and the
+//! 2. *Shade*: along each row the place on the land is interpolated between these columns (eight pixels at a time) and the
 //!    road's texture or the land's map is looked up at the resolution that fits. Where the ground breaks off between two
 //!    columns, each pixel is marched on its own. Pixels without ground show the sky.
 //! 3. *Stand*: walls and upright things are drawn where they are nearer than the ground.
@@ -18,11 +18,11 @@ use super::math::{Vec3, atan2, vec3};
 use super::objects;
 use super::road_texture::{ACROSS_UNITS, ACROSS_UNITS_PER_M, ALONG_UNITS_PER_M, HALF_M, Level};
 use super::sky::AROUND;
-use super::terrain::{GROUND_UNITS_PER_M, GroundLevel, NO_STATION, clip};
+use super::terrain::{GROUND_UNITS_PER_M, GroundLevel, NO_STATION, clip, fixed};
 use super::world::World;
 
 /// Pixels between marched columns.
-const SPAN: usize = 4;
+const SPAN: usize = 8;
 /// Marched columns: one more than spans, so that the last span has two ends.
 const ANCHORS: usize = WIDTH / SPAN + 1;
 /// Nothing farther than this is drawn as land, m.
@@ -88,6 +88,14 @@ struct Spot {
     sin: f32,
 }
 
+/// The resolutions that fit the distance of a place, and the air's share of its colour, of 256.
+#[derive(Clone, Copy)]
+struct Levels<'a> {
+    road: Level<'a>,
+    ground: GroundLevel<'a>,
+    air: u32,
+}
+
 /// A place between two spots: on the land, and on the road.
 #[derive(Clone, Copy)]
 struct Place {
@@ -115,9 +123,7 @@ impl Renderer {
         let limit = (world.terrain.nx as f32 - 1.01, world.terrain.ny as f32 - 1.01);
         let view = View { world, variant, camera, eye, limit, columns };
         frame.pixels.resize(WIDTH * HEIGHT * 3, 0);
-        for k in 0..ANCHORS {
-            self.march_column(&view, k);
-        }
+        self.march(&view);
         self.shade(&view, frame);
         objects::draw(&mut self.depths, &view, frame);
         self.bonnet.draw(mount, variant, frame);
@@ -128,20 +134,20 @@ impl Renderer {
         1.0 / self.depths[row * WIDTH + column]
     }
 
-    fn march_column(&mut self, view: &View, k: usize) {
-        let (mut depth, mut fall) = (0.9, -1.0);
-        for row in (0..HEIGHT).rev() {
-            let ray = view.ray(k, row);
-            match view.march(ray, depth, fall) {
-                Some(hit) => {
-                    self.anchors[row * ANCHORS + k] = 1.0 / hit;
-                    (depth, fall) = (hit, ray.z);
-                }
-                None => {
-                    for above in 0..=row {
-                        self.anchors[above * ANCHORS + k] = 0.0;
+    /// Finds the depth at every row of the marched columns. Rows are the outer loop: the searches of a row do not depend
+    /// on each other, so the processor works on several at once.
+    fn march(&mut self, view: &View) {
+        let mut lasts = [Some((0.9, -1.0)); ANCHORS];
+        for (row, anchors) in self.anchors.chunks_exact_mut(ANCHORS).enumerate().rev() {
+            for (k, (anchor, last)) in anchors.iter_mut().zip(&mut lasts).enumerate() {
+                // Above the first ray that meets no land none does.
+                *anchor = 0.0;
+                if let Some((depth, fall)) = *last {
+                    let ray = view.ray(k, row);
+                    *last = view.march(ray, depth, fall).map(|hit| (hit, ray.z));
+                    if let Some((hit, _)) = *last {
+                        *anchor = 1.0 / hit;
                     }
-                    return;
                 }
             }
         }
@@ -157,14 +163,23 @@ impl Renderer {
             }
             let pixels = &mut frame.pixels[row * WIDTH * 3..(row + 1) * WIDTH * 3];
             let depths = &mut self.depths[row * WIDTH..(row + 1) * WIDTH];
+            let mut known = spots[0];
+            let mut levels = view.levels(&known, (below[0] - known.inverse).abs());
             for (k, (out, depth)) in pixels.chunks_exact_mut(3 * SPAN).zip(depths.chunks_exact_mut(SPAN)).enumerate() {
                 let (a, b) = (&spots[k], &spots[k + 1]);
                 if a.inverse == 0.0 && b.inverse == 0.0 {
                     depth.fill(0.0);
                     view.shade_sky(row, k, out);
                 } else if let Some(lap) = view.join(a, b) {
-                    let fall = (below[k] - a.inverse).abs();
-                    view.shade_span(a, b, lap, fall, out, depth);
+                    // The resolution changes slowly along a row.
+                    if a.look != known.look
+                        || a.near_road != known.near_road
+                        || (a.depth - known.depth).abs() > 0.08 * a.depth
+                    {
+                        levels = view.levels(a, (below[k] - a.inverse).abs());
+                        known = *a;
+                    }
+                    view.shade_span(a, b, lap, &levels, out, depth);
                 } else {
                     view.shade_each(row, k, a, b, out, depth);
                 }
@@ -217,7 +232,7 @@ impl View<'_> {
         let depth = 1.0 / inverse;
         let gx = clip(self.eye.x + depth * ray.x, self.limit.0);
         let gy = clip(self.eye.y + depth * ray.y, self.limit.1);
-        let (x, y) = ((gx * GROUND_UNITS_PER_M) as i32, (gy * GROUND_UNITS_PER_M) as i32);
+        let (x, y) = (fixed(gx * GROUND_UNITS_PER_M), fixed(gy * GROUND_UNITS_PER_M));
         let mut spot = Spot { depth, inverse, x, y, ..Spot::default() };
         let station = self.world.terrain.station_at_grid(gx, gy);
         if station == NO_STATION {
@@ -235,12 +250,12 @@ impl View<'_> {
         }
         spot.near_road = true;
         spot.look = s.look;
-        spot.along = ((s.along_m + arc + self.variant.road_shift_m) * ALONG_UNITS_PER_M) as i32;
-        spot.across = ((across + HALF_M) * ACROSS_UNITS_PER_M) as i32;
+        spot.along = fixed((s.along_m + arc + self.variant.road_shift_m) * ALONG_UNITS_PER_M);
+        spot.across = fixed((across + HALF_M) * ACROSS_UNITS_PER_M);
         spot.cos = ((ray.x * s.tx + ray.y * s.ty) * level).abs();
         spot.sin = ((ray.x * s.ty - ray.y * s.tx) * level).abs();
         if depth < SMOOTH_LIGHT_M {
-            spot.light = u32::from(self.variant.road_light[self.world.ground.light(gx, gy) as u8 as usize]);
+            spot.light = u32::from(self.variant.road_light[fixed(self.world.ground.light(gx, gy)) as usize & 255]);
         }
         spot
     }
@@ -259,7 +274,7 @@ impl View<'_> {
         if a.near_road != b.near_road || a.look != b.look {
             return None;
         }
-        let length = (self.world.road_length_m * ALONG_UNITS_PER_M) as i32;
+        let length = fixed(self.world.road_length_m * ALONG_UNITS_PER_M);
         let way = b.along - a.along;
         let lap = if way > length / 2 {
             -length
@@ -268,13 +283,14 @@ impl View<'_> {
         } else {
             0
         };
-        let limit = ((1.5 + 0.6 * a.depth) * ACROSS_UNITS_PER_M) as i32;
-        ((way + lap).abs() < limit && (b.across - a.across).abs() < limit).then_some(lap)
+        let reach_m = 1.5 + 0.9 * a.depth;
+        let (along, across) = (fixed(reach_m * ALONG_UNITS_PER_M), fixed(reach_m * ACROSS_UNITS_PER_M));
+        ((way + lap).abs() < along && (b.across - a.across).abs() < across).then_some(lap)
     }
 
     /// The resolution that fits: the road's texture and the land's map; and the air's share of the colour.
     #[inline(always)]
-    fn levels(&self, a: &Spot, fall: f32) -> (Level<'_>, GroundLevel<'_>, u32) {
+    fn levels(&self, a: &Spot, fall: f32) -> Levels<'_> {
         let wide = a.depth * (1.0 / FOCAL_PX);
         let long = a.depth * a.depth * fall;
         let larger = |p: f32, q: f32| if p > q { p } else { q };
@@ -282,18 +298,17 @@ impl View<'_> {
         let across = larger(a.sin * long, a.cos * wide);
         let road = self.world.textures[a.look as usize].level(along, across);
         let ground = self.world.ground.level(wide * larger(2.0 * wide, long));
-        (road, ground, self.air(a.depth))
+        Levels { road, ground, air: self.air(a.depth) }
     }
 
     /// Share of the air, of 256, in the colour of a thing at `depth`.
     #[inline(always)]
     pub(super) fn air(&self, depth: f32) -> u32 {
-        (256.0 * depth / (depth + self.world.haze_m)) as u8 as u32
+        fixed(255.0 * depth / (depth + self.world.haze_m)) as u32
     }
 
     #[inline(always)]
-    fn shade_span(&self, a: &Spot, b: &Spot, lap: i32, fall: f32, out: &mut [u8], depths: &mut [f32]) {
-        let (road, ground, air) = self.levels(a, fall);
+    fn shade_span(&self, a: &Spot, b: &Spot, lap: i32, levels: &Levels, out: &mut [u8], depths: &mut [f32]) {
         let (dx, dy) = ((b.x - a.x) / SPAN as i32, (b.y - a.y) / SPAN as i32);
         let (du, dv) = ((b.along + lap - a.along) / SPAN as i32, (b.across - a.across) / SPAN as i32);
         let di = (b.inverse - a.inverse) * (1.0 / SPAN as f32);
@@ -301,7 +316,7 @@ impl View<'_> {
         let mut inverse = a.inverse;
         for (out, depth) in out.chunks_exact_mut(3).zip(depths) {
             *depth = inverse;
-            self.put(place, a, &road, &ground, air, out);
+            self.put(place, a, levels, out);
             inverse += di;
             place = Place { x: place.x + dx, y: place.y + dy, along: place.along + du, across: place.across + dv };
         }
@@ -309,15 +324,15 @@ impl View<'_> {
 
     /// Colours one pixel of ground. Red and blue are computed in one word, green in another.
     #[inline(always)]
-    fn put(&self, place: Place, spot: &Spot, road: &Level, ground: &GroundLevel, air: u32, out: &mut [u8]) {
+    fn put(&self, place: Place, spot: &Spot, levels: &Levels, out: &mut [u8]) {
         const RED_BLUE: u32 = 0x00ff_00ff;
         let mut texel = 0;
         if spot.near_road && (place.across as u32) < ACROSS_UNITS {
-            texel = road.fetch(place.along, place.across as u32);
+            texel = levels.road.fetch(place.along, place.across as u32);
         }
         let (mut light, mut land) = (spot.light, 0);
         if texel >> 24 != 255 || light == 0 {
-            land = ground.fetch(place.x, place.y);
+            land = levels.ground.fetch(place.x, place.y);
             if light == 0 {
                 light = u32::from(self.variant.road_light[(land >> 24) as usize]);
             }
@@ -329,16 +344,19 @@ impl View<'_> {
             red_blue = (red_blue * alpha + (land & RED_BLUE) * (256 - alpha)) >> 8 & RED_BLUE;
             green = (green * alpha + (land >> 8 & 255) * (256 - alpha)) >> 8;
         }
-        self.finish(red_blue | green << 8, air, out);
+        self.finish(red_blue | green << 8, levels.air, out);
     }
 
     /// Adds air and the light of the run, and writes the pixel. `colour` is `0x__BBGGRR`.
     #[inline(always)]
     pub(super) fn finish(&self, colour: u32, air: u32, out: &mut [u8]) {
         const RED_BLUE: u32 = 0x00ff_00ff;
-        let haze = self.variant.haze;
-        let red_blue = ((colour & RED_BLUE) * (256 - air) + (haze & RED_BLUE) * air) >> 8;
-        let green = ((colour >> 8 & 255) * (256 - air) + (haze >> 8 & 255) * air) >> 8;
+        let (mut red_blue, mut green) = (colour & RED_BLUE, colour >> 8 & 255);
+        if air > 3 {
+            let haze = self.variant.haze;
+            red_blue = (red_blue * (256 - air) + (haze & RED_BLUE) * air) >> 8;
+            green = (green * (256 - air) + (haze >> 8 & 255) * air) >> 8;
+        }
         let tone = &self.variant.tone;
         out[0] = tone[0][(red_blue & 255) as usize];
         out[1] = tone[1][(green & 255) as usize];
@@ -365,7 +383,7 @@ impl View<'_> {
         self.finish(self.world.sky.fetch(turn, tangent), 0, out);
     }
 
-    /// Colours four pixels between which the ground breaks off, each on its own.
+    /// Colours eight pixels between which the ground breaks off, each on its own.
     fn shade_each(&self, row: usize, k: usize, a: &Spot, b: &Spot, out: &mut [u8], depths: &mut [f32]) {
         let nearest = 0.93 / a.inverse.max(b.inverse);
         let level = self.columns[k].level;
@@ -380,9 +398,9 @@ impl View<'_> {
             let spot = self.spot(ray, level, *depth);
             // On level ground inverse depth grows with the fall of the ray.
             let fall = (self.camera.up.z / FOCAL_PX / (ray.z - 1e-3).abs()).min(1.0) * spot.inverse;
-            let (road, ground, air) = self.levels(&spot, fall);
+            let levels = self.levels(&spot, fall);
             let place = Place { x: spot.x, y: spot.y, along: spot.along, across: spot.across };
-            self.put(place, &spot, &road, &ground, air, out);
+            self.put(place, &spot, &levels, out);
         }
     }
 }

@@ -35,14 +35,17 @@ pub struct Level<'a> {
     log2_across: u32,
 }
 
-/// Bits behind the point of fixed-point places; the unit is the finest texel.
-pub const FRACTION_BITS: u32 = 12;
+/// Bits behind the point of fixed-point places along the road; the unit is the finest texel. With these a whole lap of
+/// 1,500 m stays below 2^22, which [`fixed`](super::terrain::fixed) needs.
+const ALONG_BITS: u32 = 6;
+/// The same across the road.
+const ACROSS_BITS: u32 = 12;
 /// Fixed-point units for each metre along the road.
-pub const ALONG_UNITS_PER_M: f32 = (SIZE << FRACTION_BITS) as f32 / PERIOD_M;
+pub const ALONG_UNITS_PER_M: f32 = (SIZE << ALONG_BITS) as f32 / PERIOD_M;
 /// Fixed-point units for each metre across.
-pub const ACROSS_UNITS_PER_M: f32 = (SIZE << FRACTION_BITS) as f32 / (2.0 * HALF_M);
+pub const ACROSS_UNITS_PER_M: f32 = (SIZE << ACROSS_BITS) as f32 / (2.0 * HALF_M);
 /// Places across at or above this are beyond the texture.
-pub const ACROSS_UNITS: u32 = (SIZE << FRACTION_BITS) as u32;
+pub const ACROSS_UNITS: u32 = (SIZE << ACROSS_BITS) as u32;
 
 impl Level<'_> {
     /// The texel at fixed-point places `along` (any) and `across` (from the left rim of the texture, below
@@ -91,8 +94,8 @@ impl RoadTexture {
         let from = self.offsets[i][j] as usize;
         Level {
             texels: &self.texels[from..from + (SIZE >> i) * (SIZE >> j)],
-            along_shift: FRACTION_BITS + i as u32,
-            across_shift: FRACTION_BITS + j as u32,
+            along_shift: ALONG_BITS + i as u32,
+            across_shift: ACROSS_BITS + j as u32,
             along_mask: (SIZE >> i) - 1,
             log2_across: LOG2_SIZE - j as u32,
         }

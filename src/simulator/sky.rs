@@ -2,7 +2,7 @@
 
 use super::math::{hash2, lerp, smoothstep, value_noise};
 use super::road_texture::pack;
-use super::terrain::clip;
+use super::terrain::{clip, fixed};
 use super::track::Track;
 
 /// Texels around the horizon; a power of two.
@@ -71,8 +71,8 @@ impl Sky {
     /// The texel in the direction `around` (in texels, any value) with the given tangent of the elevation.
     #[inline(always)]
     pub fn fetch(&self, around: f32, tangent: f32) -> u32 {
-        let i = (around as i32) as usize & (AROUND - 1);
-        let j = clip((tangent - LOWEST) * PER_TANGENT, UP as f32 - 1.0) as i32 as usize;
+        let i = fixed(around) as usize & (AROUND - 1);
+        let j = fixed(clip((tangent - LOWEST) * PER_TANGENT, UP as f32 - 1.0)) as usize;
         self.texels[j * AROUND + i]
     }
 }

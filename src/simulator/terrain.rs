@@ -395,7 +395,7 @@ impl GroundMap {
 }
 
 /// Bits behind the point of fixed-point places on the map; the unit is the finest texel of 0.5 m.
-pub const GROUND_FRACTION_BITS: u32 = 12;
+pub const GROUND_FRACTION_BITS: u32 = 10;
 /// Fixed-point units for each metre.
 pub const GROUND_UNITS_PER_M: f32 = (2 << GROUND_FRACTION_BITS) as f32;
 
@@ -422,6 +422,13 @@ impl GroundLevel<'_> {
 pub fn clip(x: f32, high: f32) -> f32 {
     let x = if x > 0.0 { x } else { 0.0 };
     if x < high { x } else { high }
+}
+
+/// The nearest whole number, for numbers below 2^22 in size; without the checks of a cast.
+#[inline(always)]
+pub fn fixed(x: f32) -> i32 {
+    // 1.5 * 2^23: the sum has the number in the low bits of its mantissa, negative ones too.
+    (x + 12_582_912.0).to_bits() as i32 - 0x4b40_0000
 }
 
 /// Whole part and rest of a number in [0, 2^22).
