@@ -13,6 +13,7 @@ pub mod pilot;
 pub mod random;
 pub mod recipe;
 pub mod report;
+pub mod simulator;
 pub mod tensor;
 pub mod training;
 

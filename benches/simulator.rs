@@ -1,0 +1,75 @@
+//! How fast the simulator takes pictures, records and drives; one core each.
+
+use std::hint::black_box;
+
+use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
+use steersman::simulator::run::run;
+use steersman::simulator::{
+    Camera, DriveState, Driver, Expert, Mount, Renderer, RgbFrame, RunOptions, Simulation, Speed, Start, Track,
+    Variant, jpeg,
+};
+
+/// Cameras all around a lap, so that every kind of view is in the mean.
+fn cameras(track: &Track) -> Vec<Camera> {
+    (0..64)
+        .map(|k| {
+            let s_m = track.length_m * f64::from(k) / 64.0;
+            let start = Start { s_m, reverse: false, offset_m: 0.3, heading_deg: 1.0 };
+            Camera::new(&Simulation::new(track, start, 9.0).body_pose(), Mount::Center)
+        })
+        .collect()
+}
+
+fn pictures(c: &mut Criterion) {
+    let mut group = c.benchmark_group("simulator");
+    for name in ["lake", "mountain", "coast", "forest"] {
+        let track = Track::load(name).expect("a built-in track");
+        let (world, cameras) = (track.world(), cameras(&track));
+        let variant = Variant::new(world, 1);
+        let (mut renderer, mut frame, mut bytes) = (Renderer::default(), RgbFrame::default(), Vec::new());
+        group.throughput(Throughput::Elements(cameras.len() as u64));
+        group.bench_function(BenchmarkId::new("render", name), |b| {
+            b.iter(|| {
+                for camera in &cameras {
+                    renderer.render(world, &variant, camera, Mount::Center, &mut frame);
+                    black_box(&frame);
+                }
+            });
+        });
+        group.bench_function(BenchmarkId::new("render_and_jpeg", name), |b| {
+            b.iter(|| {
+                for camera in &cameras {
+                    renderer.render(world, &variant, camera, Mount::Center, &mut frame);
+                    bytes.clear();
+                    jpeg::encode(&frame, &mut bytes).expect("a frame of the right size");
+                    black_box(&bytes);
+                }
+            });
+        });
+    }
+    group.finish();
+}
+
+/// A driver that is shown every picture and steers like the expert.
+struct Watching;
+
+impl Driver for Watching {
+    fn steer(&mut self, frame: &RgbFrame, state: &DriveState) -> f32 {
+        black_box(frame);
+        Expert.steer(frame, state)
+    }
+}
+
+/// Simulated seconds count as elements: elements a second are the real-time factor.
+fn closed_loop(c: &mut Criterion) {
+    let track = Track::load("lake").expect("a built-in track");
+    let options = RunOptions { laps: 1, speed: Speed::Fixed(20.0), latency_ms: 0.0, noise: 0.0, assisted: false };
+    let seconds = run(&track, &mut Watching, &options, 1).expect("a run").time_s;
+    let mut group = c.benchmark_group("simulator");
+    group.sample_size(10).throughput(Throughput::Elements(seconds as u64));
+    group.bench_function("drive_simulated_seconds", |b| b.iter(|| run(&track, &mut Watching, &options, 1)));
+    group.finish();
+}
+
+criterion_group!(benches, pictures, closed_loop);
+criterion_main!(benches);

@@ -1,0 +1,76 @@
+//! The car's bonnet, as each of the three cameras sees it.
+
+use super::camera::{HEIGHT, Mount, RgbFrame, WIDTH};
+use super::light::Variant;
+
+/// Row at which the bonnet begins in a column; `HEIGHT` where there is none.
+fn top(mount: Mount, column: usize) -> f32 {
+    let x = column as f32 + 0.5;
+    let none = HEIGHT as f32;
+    let quarter = |u: f32| if u.abs() < 1.0 { none - 24.0 * (1.0 - u * u * u * u).sqrt() } else { none };
+    match mount {
+        Mount::Center => {
+            let u = (x - 166.0) / 106.0;
+            (142.0 + 17.0 * u * u * (0.75 + 0.25 * u * u)).min(none)
+        }
+        Mount::Left => quarter((WIDTH as f32 - x) / 135.0),
+        Mount::Right => quarter(x / 122.0),
+    }
+}
+
+fn colour(mount: Mount, column: usize, depth: f32) -> [f32; 3] {
+    let x = column as f32;
+    if depth < 1.2 {
+        return [58.0, 52.0, 44.0];
+    }
+    if mount == Mount::Center {
+        // The rim, a dark seam, and the scoop behind it.
+        if depth < 8.5 {
+            let k = 1.0 - 0.045 * (depth - 4.0).abs();
+            [152.0 * k, 138.0 * k, 116.0 * k]
+        } else if depth < 10.0 {
+            [44.0, 42.0, 40.0]
+        } else {
+            [168.0, 174.0, 176.0]
+        }
+    } else {
+        let lamp = if mount == Mount::Left { 204.0 } else { 102.0 };
+        if (x - lamp).abs() < 9.0 && (2.5..10.5).contains(&depth) {
+            return [236.0, 234.0, 228.0];
+        }
+        let k = 1.05 - 0.018 * depth;
+        [142.0 * k, 128.0 * k, 108.0 * k]
+    }
+}
+
+/// The pixels of the bonnet for each camera, painted once.
+pub(super) struct Bonnet([Vec<(usize, [u8; 3])>; 3]);
+
+impl Default for Bonnet {
+    fn default() -> Self {
+        Bonnet(Mount::ALL.map(|mount| {
+            let mut pixels = Vec::new();
+            for row in 0..HEIGHT {
+                for column in 0..WIDTH {
+                    let depth = row as f32 + 0.5 - top(mount, column);
+                    if depth > 0.0 {
+                        pixels.push(((row * WIDTH + column) * 3, colour(mount, column, depth).map(|c| c as u8)));
+                    }
+                }
+            }
+            pixels
+        }))
+    }
+}
+
+impl Bonnet {
+    /// Draws the bonnet over the bottom of the picture.
+    pub(super) fn draw(&self, mount: Mount, variant: &Variant, frame: &mut RgbFrame) {
+        let pixels = &self.0[Mount::ALL.iter().position(|m| *m == mount).unwrap_or(0)];
+        for (at, rgb) in pixels {
+            for c in 0..3 {
+                frame.pixels[at + c] = variant.tone[c][usize::from(rgb[c])];
+            }
+        }
+    }
+}

@@ -1,0 +1,358 @@
+//! Records drives of the expert in the format of Udacity's simulator.
+
+use std::fs;
+use std::io::{self, Write as _};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use rayon::prelude::*;
+use serde::Serialize;
+
+use super::camera::{BodyPose, Camera, Mount, RgbFrame};
+use super::car::{Controls, MPS_PER_MPH, STEP_S, STEPS_PER_S};
+use super::expert::{Keyboard, Style, pursuit};
+use super::jpeg;
+use super::light::Variant;
+use super::math::Rng;
+use super::noise::SteeringNoise;
+use super::renderer::Renderer;
+use super::simulation::{Simulation, Start};
+use super::speed::SpeedController;
+use super::track::Track;
+use crate::{Error, Result};
+
+/// Rows of the log for each second.
+pub const RECORD_HZ: u64 = 10;
+
+/// How the log is written.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum LogFormat {
+    /// As Udacity's sample data: a header, `", "` between fields, paths relative to the log.
+    #[default]
+    Sample,
+    /// As version 2 of the simulator: no header, `","` between fields, absolute paths.
+    V2,
+}
+
+/// What to record.
+#[derive(Clone, Debug)]
+pub struct RecordOptions {
+    /// Laps of normal driving, or with `recovery` laps along which the car is put off its line.
+    pub laps: f64,
+    /// Drive against the direction of the track's points.
+    pub reverse: bool,
+    /// Record only ways back to the line.
+    pub recovery: bool,
+    /// How the expert moves the wheel.
+    pub style: Style,
+    /// Draws where the drive begins, light and texture, and what happens on it.
+    pub seed: u64,
+    /// Speed to hold, mph.
+    pub speed_mph: f64,
+    /// Strength of a disturbance of the steering that the labels do not show: standard deviation of the steering.
+    pub noise: f64,
+    /// How the log is written.
+    pub format: LogFormat,
+}
+
+impl Default for RecordOptions {
+    fn default() -> Self {
+        RecordOptions {
+            laps: 1.0,
+            reverse: false,
+            recovery: false,
+            style: Style::Smooth,
+            seed: 1,
+            speed_mph: 20.0,
+            noise: 0.0,
+            format: LogFormat::Sample,
+        }
+    }
+}
+
+/// One row of the log before its pictures are taken.
+#[derive(Clone, Debug)]
+pub struct Sample {
+    /// Simulated time, s.
+    pub time_s: f64,
+    /// The car.
+    pub body: BodyPose,
+    /// Label: steering, [-1, 1], + = right.
+    pub steering: f64,
+    /// Throttle, 0 to 1.
+    pub throttle: f64,
+    /// Brake, 0 to 1.
+    pub brake: f64,
+    /// Speed, mph.
+    pub speed_mph: f64,
+}
+
+/// What a recording is, beside the log.
+#[derive(Clone, Debug, Serialize)]
+pub struct RecordingInfo {
+    /// Track as given on the command line.
+    pub track: String,
+    /// Whether training must not see the track.
+    pub held_out: bool,
+    /// Seed of the recording.
+    pub seed: u64,
+    /// Laps asked for.
+    pub laps: f64,
+    /// Driven against the direction of the track's points.
+    pub reverse: bool,
+    /// Only ways back to the line.
+    pub recovery: bool,
+    /// `smooth` or `keyboard`.
+    pub style: String,
+    /// Speed held, mph.
+    pub speed_mph: f64,
+    /// Disturbance of the steering.
+    pub noise: f64,
+    /// Rows for each second.
+    pub hz: u64,
+    /// Rows of the log.
+    pub rows: usize,
+}
+
+/// The expert driving for a recording.
+struct Session<'a> {
+    simulation: Simulation<'a>,
+    speed: SpeedController,
+    keyboard: Option<Keyboard>,
+    noise: SteeringNoise,
+    target_mph: f64,
+}
+
+impl Session<'_> {
+    /// Drives one step; returns the label and the throttle that were in force.
+    fn step(&mut self) -> (f64, f64) {
+        let steering = match &mut self.keyboard {
+            Some(keyboard) => keyboard.steer(&self.simulation),
+            None => pursuit(&self.simulation),
+        };
+        let throttle = self.speed.throttle(self.target_mph, self.simulation.car.speed_mps / MPS_PER_MPH, STEP_S);
+        let disturbed = steering + self.noise.next(STEP_S);
+        self.simulation.step(Controls { steering: disturbed, throttle });
+        (steering, throttle)
+    }
+
+    fn sample(&self, time_s: f64, (steering, throttle): (f64, f64), body: BodyPose, speed_mps: f64) -> Sample {
+        let speed_mph = speed_mps / MPS_PER_MPH;
+        Sample { time_s, body, steering, throttle: throttle.max(0.0), brake: (-throttle).max(0.0), speed_mph }
+    }
+
+    /// Drives `steps` steps or until `done`, taking a sample at every tenth of a second.
+    fn drive(&mut self, steps: u64, samples: &mut Vec<Sample>, done: impl Fn(&Simulation) -> bool) {
+        for step in 0..steps {
+            if done(&self.simulation) {
+                return;
+            }
+            let due = step % (STEPS_PER_S / RECORD_HZ) == 0;
+            let before =
+                due.then(|| (self.simulation.time_s(), self.simulation.body_pose(), self.simulation.car.speed_mps));
+            let driven = self.step();
+            if let Some((time_s, body, speed_mps)) = before {
+                samples.push(self.sample(time_s, driven, body, speed_mps));
+            }
+        }
+    }
+}
+
+/// Drives what `options` ask for and returns the rows, without pictures.
+pub fn drive_expert(track: &Track, options: &RecordOptions) -> Vec<Sample> {
+    let mut rng = Rng::new(options.seed, "recording");
+    let start = Start { reverse: options.reverse, ..Start::draw(track, options.seed) };
+    let speed_mps = options.speed_mph * MPS_PER_MPH;
+    let mut session = Session {
+        simulation: Simulation::new(track, start, speed_mps),
+        speed: SpeedController::default(),
+        keyboard: (options.style == Style::Keyboard).then(Keyboard::default),
+        noise: SteeringNoise::new(options.seed, options.noise),
+        target_mph: options.speed_mph,
+    };
+    let way_m = options.laps * track.length_m;
+    let most_steps = (way_m / speed_mps.max(1.0) * 3.0) as u64 * STEPS_PER_S + 500;
+    let mut samples = Vec::new();
+    if !options.recovery {
+        session.drive(most_steps, &mut samples, |s| s.progress_m >= way_m);
+        return samples;
+    }
+    // Every 22 m or so the car is put off its line, on alternating sides, and the way back is recorded.
+    let mut s_m = start.s_m;
+    let mut gone_m = 0.0;
+    let mut side = if rng.unit() < 0.5 { 1.0 } else { -1.0 };
+    while gone_m < way_m {
+        let room = track.at(s_m).width_m / 2.0 - 1.2;
+        let offset_m = side * rng.between(0.7, 2.2).min(room);
+        let heading_deg = rng.between(-4.0, 12.0) * side;
+        session.simulation.put(Start { s_m, reverse: options.reverse, offset_m, heading_deg }, speed_mps);
+        session.keyboard = session.keyboard.map(|_| Keyboard::default());
+        session.drive(3 * STEPS_PER_S, &mut samples, |s| s.cte_m().abs() < 0.1 && s.heading_error().abs() < 0.03);
+        // A pause in the names of the pictures, so that a reader sees where one stretch ends and the next begins.
+        session.simulation.steps += 2 * STEPS_PER_S;
+        let step_m = rng.between(16.0, 28.0);
+        gone_m += step_m;
+        s_m += if options.reverse { -step_m } else { step_m };
+        side = -side;
+    }
+    samples
+}
+
+/// Records a drive of the expert into the new folder `out`: `driving_log.csv`, `IMG/` and `recording.toml`.
+///
+/// Pictures are taken on all threads; the files do not depend on their number. `progress` is told the share that is done
+/// and may return `false` to stop.
+///
+/// # Errors
+/// If `out` exists, if something cannot be written, or if `progress` stopped it. What was written stays.
+pub fn record(
+    track: &Track,
+    options: &RecordOptions,
+    out: &Path,
+    progress: &(dyn Fn(f64) -> bool + Sync),
+) -> Result<RecordingInfo> {
+    if !(options.laps > 0.0 && options.laps <= 1000.0) {
+        return Err(Error::Usage(format!("laps {}: more than 0 and at most 1000 can be recorded", options.laps)));
+    }
+    if !(5.0..=30.0).contains(&options.speed_mph) {
+        return Err(Error::Usage(format!("speed {} mph: 5 to 30 mph can be recorded", options.speed_mph)));
+    }
+    let samples = drive_expert(track, options);
+    write_recording(track, options, &samples, out, progress)
+}
+
+/// Takes the pictures of `samples` and writes a recording, as [`record`] does.
+///
+/// # Errors
+/// As [`record`].
+pub fn write_recording(
+    track: &Track,
+    options: &RecordOptions,
+    samples: &[Sample],
+    out: &Path,
+    progress: &(dyn Fn(f64) -> bool + Sync),
+) -> Result<RecordingInfo> {
+    create_new_folder(out)?;
+    let images = out.join("IMG");
+    fs::create_dir(&images).map_err(Error::io(&images))?;
+    let world = track.world();
+    let variant = Variant::new(world, options.seed);
+    let done = AtomicUsize::new(0);
+    samples.par_iter().try_for_each_init(
+        || (Renderer::default(), RgbFrame::default(), Vec::new()),
+        |(renderer, frame, bytes), sample| {
+            for mount in Mount::ALL {
+                renderer.render(world, &variant, &Camera::new(&sample.body, mount), mount, frame);
+                bytes.clear();
+                jpeg::encode(frame, bytes)?;
+                let path = images.join(image_name(mount, sample.time_s));
+                fs::write(&path, &bytes).map_err(Error::io(&path))?;
+            }
+            let count = done.fetch_add(1, Ordering::Relaxed) + 1;
+            if progress(count as f64 / samples.len() as f64) { Ok(()) } else { Err(Error::Interrupted) }
+        },
+    )?;
+    let log = out.join("driving_log.csv");
+    write_log(&log, samples, options.format).map_err(Error::io(&log))?;
+    let info = RecordingInfo {
+        track: track.name().to_string(),
+        held_out: track.held_out(),
+        seed: options.seed,
+        laps: options.laps,
+        reverse: options.reverse,
+        recovery: options.recovery,
+        style: if options.style == Style::Keyboard { "keyboard" } else { "smooth" }.to_string(),
+        speed_mph: options.speed_mph,
+        noise: options.noise,
+        hz: RECORD_HZ,
+        rows: samples.len(),
+    };
+    let side = out.join("recording.toml");
+    let text = toml::to_string(&info).map_err(|e| Error::data(&side, e.to_string()))?;
+    fs::write(&side, text).map_err(Error::io(&side))?;
+    Ok(info)
+}
+
+/// Creates `out` with its parents; refuses one that exists.
+pub(super) fn create_new_folder(out: &Path) -> Result<()> {
+    if let Some(parent) = out.parent().filter(|p| !p.as_os_str().is_empty()) {
+        fs::create_dir_all(parent).map_err(Error::io(parent))?;
+    }
+    fs::create_dir(out).map_err(|source| {
+        if source.kind() == io::ErrorKind::AlreadyExists {
+            Error::Usage(format!(
+                "{}: exists already and is not overwritten; name a new folder or remove it",
+                out.display()
+            ))
+        } else {
+            Error::Io { path: out.to_path_buf(), source }
+        }
+    })
+}
+
+/// Name of a picture taken `time_s` after noon of 1 January 2026, the simulator's fixed date.
+fn image_name(mount: Mount, time_s: f64) -> String {
+    let ms = (time_s * 1000.0).round() as u64 + 12 * 3_600_000;
+    let (day, ms) = (1 + ms / 86_400_000, ms % 86_400_000);
+    let (hour, minute, second) = (ms / 3_600_000, ms / 60_000 % 60, ms / 1000 % 60);
+    format!("{}_2026_01_{day:02}_{hour:02}_{minute:02}_{second:02}_{:03}.jpg", mount.name(), ms % 1000)
+}
+
+fn write_log(log: &Path, samples: &[Sample], format: LogFormat) -> io::Result<()> {
+    let (separator, folder) = match format {
+        LogFormat::Sample => (", ", PathBuf::from("IMG")),
+        LogFormat::V2 => (",", std::path::absolute(log)?.with_file_name("IMG")),
+    };
+    let mut text = Vec::new();
+    if format == LogFormat::Sample {
+        writeln!(text, "center,left,right,steering,throttle,brake,speed")?;
+    }
+    for sample in samples {
+        for mount in Mount::ALL {
+            let name = image_name(mount, sample.time_s);
+            match format {
+                LogFormat::Sample => write!(text, "IMG/{name}{separator}")?,
+                LogFormat::V2 => write!(text, "{}{separator}", folder.join(name).display())?,
+            }
+        }
+        let numbers =
+            [sample.steering, sample.throttle, sample.brake, sample.speed_mph].map(|v| (v as f32).to_string());
+        writeln!(text, "{}", numbers.join(separator))?;
+    }
+    fs::write(log, text)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_carry_simulated_time() {
+        assert_eq!(image_name(Mount::Left, 0.1), "left_2026_01_01_12_00_00_100.jpg");
+        assert_eq!(image_name(Mount::Center, 43_261.02), "center_2026_01_02_00_01_01_020.jpg");
+    }
+
+    #[test]
+    fn a_lap_is_sampled_at_ten_hertz_and_holds_the_speed() {
+        let track = Track::load("forest").unwrap();
+        let samples = drive_expert(&track, &RecordOptions::default());
+        let expected = track.length_m / (20.0 * MPS_PER_MPH) * 10.0;
+        assert!((samples.len() as f64 - expected).abs() < 0.08 * expected, "{} of {expected}", samples.len());
+        assert!(samples.windows(2).all(|w| (w[1].time_s - w[0].time_s - 0.1).abs() < 1e-6));
+        let settled = &samples[100..];
+        assert!(settled.iter().all(|s| (s.speed_mph - 20.0).abs() < 2.5));
+    }
+
+    #[test]
+    fn recovery_steers_back_and_keyboard_labels_are_often_zero() {
+        let track = Track::load("lake").unwrap();
+        let recovery = drive_expert(&track, &RecordOptions { recovery: true, ..Default::default() });
+        let spread = |samples: &[Sample]| samples.iter().map(|s| s.steering.abs()).sum::<f64>() / samples.len() as f64;
+        let smooth = drive_expert(&track, &RecordOptions::default());
+        assert!(recovery.len() > 300 && spread(&recovery) > 1.5 * spread(&smooth));
+        let keys = drive_expert(&track, &RecordOptions { style: Style::Keyboard, ..Default::default() });
+        let zero =
+            |samples: &[Sample]| samples.iter().filter(|s| s.steering == 0.0).count() as f64 / samples.len() as f64;
+        assert!(zero(&keys) > 0.4 && zero(&smooth) < 0.05, "{} {}", zero(&keys), zero(&smooth));
+    }
+}

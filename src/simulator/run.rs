@@ -1,0 +1,337 @@
+//! One closed-loop run: a driver steers by what the camera shows, free or assisted.
+
+use std::collections::VecDeque;
+
+use super::camera::{Camera, Mount, RgbFrame};
+use super::car::{Controls, MAX_STEER_DEG, MPS_PER_MPH, STEP_S, STEPS_PER_S};
+use super::expert;
+use super::jpeg::RoundTrip;
+use super::light::Variant;
+use super::noise::SteeringNoise;
+use super::renderer::Renderer;
+use super::simulation::{Simulation, Start};
+use super::speed::{Speed, SpeedController};
+use super::track::Track;
+use crate::Result;
+
+/// Frames that a driver sees in each second. At 50 steps a second they come after 3 and 2 steps in turn.
+pub const DRIVE_HZ: u64 = 20;
+/// Distance from the line at which an assisted run is interrupted, m (NVIDIA 2016).
+pub const INTERVENTION_M: f64 = 1.0;
+/// Time charged for an intervention, s (NVIDIA 2016).
+pub const INTERVENTION_S: f64 = 6.0;
+/// Longest time with more than two wheels off the road, s.
+const OFF_ROAD_LIMIT_S: f64 = 1.0;
+/// Longest time standing still, s.
+const STANDING_LIMIT_S: f64 = 10.0;
+
+/// What a driver may know beside the picture.
+pub struct DriveState<'a> {
+    /// The car on its track. A driver that is to be judged looks only at the picture and at the speed.
+    pub simulation: &'a Simulation<'a>,
+    /// Speed, mph.
+    pub speed_mph: f64,
+}
+
+/// Something that steers.
+pub trait Driver {
+    /// The steering, [-1, 1], + = right, for what the camera shows: 320x160, after JPEG, as it would be served.
+    fn steer(&mut self, frame: &RgbFrame, state: &DriveState) -> f32;
+
+    /// Whether `steer` looks at the picture; if not, none is taken.
+    fn needs_frame(&self) -> bool {
+        true
+    }
+}
+
+/// The driver whose steering is the label of recordings.
+pub struct Expert;
+
+impl Driver for Expert {
+    fn steer(&mut self, _: &RgbFrame, state: &DriveState) -> f32 {
+        expert::pursuit(state.simulation) as f32
+    }
+
+    fn needs_frame(&self) -> bool {
+        false
+    }
+}
+
+/// The driver that never steers; what any other must beat.
+pub struct Zero;
+
+impl Driver for Zero {
+    fn steer(&mut self, _: &RgbFrame, _: &DriveState) -> f32 {
+        0.0
+    }
+
+    fn needs_frame(&self) -> bool {
+        false
+    }
+}
+
+/// Why a free run ended early.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Failure {
+    /// Hit a wall.
+    Crash,
+    /// More than one pair of wheels off the road for more than 1 s.
+    LeftRoad,
+    /// Stood still for more than 10 s.
+    StoodStill,
+}
+
+/// One moment of a run, taken when a frame is shown.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Moment {
+    /// Time since the start, s.
+    pub time_s: f64,
+    /// East, m.
+    pub x: f64,
+    /// North, m.
+    pub y: f64,
+    /// Place along the line, m.
+    pub s_m: f64,
+    /// Cross-track error, m, + = right as driven.
+    pub cte_m: f64,
+    /// What the driver asked for, [-1, 1].
+    pub steering: f64,
+    /// Throttle, [-1, 1].
+    pub throttle: f64,
+    /// Speed, mph.
+    pub speed_mph: f64,
+    /// Whether the car was just put back.
+    pub intervention: bool,
+}
+
+/// What one run of a driver came to.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Run {
+    /// Moments at 20 Hz.
+    pub moments: Vec<Moment>,
+    /// Whole laps driven.
+    pub laps_completed: usize,
+    /// Way made along the line, m.
+    pub distance_m: f64,
+    /// Simulated time, s.
+    pub time_s: f64,
+    /// Time with more than two wheels off the road, s.
+    pub off_road_s: f64,
+    /// Why the run ended early; never in an assisted run.
+    pub failure: Option<Failure>,
+    /// Times the car was put back; 0 in a free run.
+    pub interventions: usize,
+    /// Largest distance from the line at any step, m.
+    pub worst_cte_m: f64,
+    /// Sum of squared changes of the wheel's angle, deg²/s, to be divided by the time for the whiteness squared.
+    pub whiteness_sum: f64,
+}
+
+impl Run {
+    /// Share of the time in which nobody had to help, %: `(1 - 6 s * interventions / time) * 100`, not below 0.
+    pub fn autonomy_percent(&self) -> f64 {
+        (100.0 * (1.0 - INTERVENTION_S * self.interventions as f64 / self.time_s.max(STEP_S))).max(0.0)
+    }
+}
+
+/// How a run is driven.
+#[derive(Clone, Copy, Debug)]
+pub struct RunOptions {
+    /// Laps to drive.
+    pub laps: usize,
+    /// Speed to hold.
+    pub speed: Speed,
+    /// Time from a picture to the wheels, ms, in steps of 20.
+    pub latency_ms: f64,
+    /// Standard deviation of a disturbance of the steering, [-1, 1].
+    pub noise: f64,
+    /// Put the car back when it is too far from the line, instead of ending the run when it fails.
+    pub assisted: bool,
+}
+
+/// Drives one run whose start, light and noise `seed` draws.
+///
+/// # Errors
+/// If a picture cannot be encoded.
+pub fn run(track: &Track, driver: &mut dyn Driver, options: &RunOptions, seed: u64) -> Result<Run> {
+    let mut simulation = Simulation::new(track, Start::draw(track, seed), options.speed.at_start_mps());
+    let mut eye = driver.needs_frame().then(|| Eye::new(track, seed));
+    let blank = RgbFrame::default();
+    let mut controller = SpeedController::default();
+    let mut noise = SteeringNoise::new(seed, options.noise);
+    let latency_steps = (options.latency_ms / 1000.0 * STEPS_PER_S as f64).round() as u64;
+    // Steering on its way to the wheels: the step at which it arrives, and its value.
+    let mut pending: VecDeque<(u64, f64)> = VecDeque::new();
+    let way_m = options.laps as f64 * track.length_m;
+    let slowest_mps = 0.25 * options.speed.at_start_mps().max(2.0);
+    let most_steps = ((way_m / slowest_mps + 60.0) * STEPS_PER_S as f64) as u64;
+    let mut controls = Controls::default();
+    let (mut shown, mut frames, mut steering) = (0, 0, 0.0);
+    let (mut off_steps, mut standing_steps) = (0u64, 0u64);
+    let mut put_back = false;
+    let mut result = Run {
+        moments: Vec::new(),
+        laps_completed: 0,
+        distance_m: 0.0,
+        time_s: 0.0,
+        off_road_s: 0.0,
+        failure: None,
+        interventions: 0,
+        worst_cte_m: simulation.cte_m().abs(),
+        whiteness_sum: 0.0,
+    };
+    while simulation.progress_m < way_m && simulation.steps < most_steps && result.failure.is_none() {
+        let step = simulation.steps;
+        if step * DRIVE_HZ >= frames * STEPS_PER_S {
+            let dt_s = if frames == 0 { 1.0 / DRIVE_HZ as f64 } else { (step - shown) as f64 * STEP_S };
+            let speed_mph = simulation.car.speed_mps / MPS_PER_MPH;
+            let frame = match &mut eye {
+                Some(eye) => eye.look(&simulation)?,
+                None => &blank,
+            };
+            let answer = f64::from(driver.steer(frame, &DriveState { simulation: &simulation, speed_mph }));
+            // A driver that answers nonsense steers straight ahead.
+            let answer = if answer.is_finite() { answer.clamp(-1.0, 1.0) } else { 0.0 };
+            if frames > 0 {
+                let change = (answer - steering) * MAX_STEER_DEG;
+                result.whiteness_sum += change * change / dt_s;
+            }
+            steering = answer;
+            pending.push_back((step + latency_steps, answer + noise.next(dt_s)));
+            controls.throttle = controller.throttle(options.speed.target_mph(&simulation), speed_mph, dt_s);
+            result.moments.push(Moment {
+                time_s: simulation.time_s(),
+                x: simulation.car.x,
+                y: simulation.car.y,
+                s_m: simulation.location.s_m,
+                cte_m: simulation.cte_m(),
+                steering,
+                throttle: controls.throttle,
+                speed_mph,
+                intervention: std::mem::take(&mut put_back),
+            });
+            (shown, frames) = (step, frames + 1);
+        }
+        while pending.front().is_some_and(|(at, _)| *at <= step) {
+            controls.steering = pending.pop_front().map_or(0.0, |(_, value)| value);
+        }
+        simulation.step(controls);
+
+        let off = simulation.wheels_off > 2;
+        off_steps = if off { off_steps + 1 } else { 0 };
+        standing_steps = if simulation.car.speed_mps < 0.1 { standing_steps + 1 } else { 0 };
+        result.off_road_s += if off { STEP_S } else { 0.0 };
+        result.worst_cte_m = result.worst_cte_m.max(simulation.cte_m().abs());
+        if options.assisted {
+            if simulation.cte_m().abs() > INTERVENTION_M {
+                result.interventions += 1;
+                simulation.put_back();
+                pending.clear();
+                controls.steering = 0.0;
+                put_back = true;
+            }
+        } else if simulation.at_wall {
+            result.failure = Some(Failure::Crash);
+        } else if off_steps as f64 * STEP_S > OFF_ROAD_LIMIT_S {
+            result.failure = Some(Failure::LeftRoad);
+        } else if standing_steps as f64 * STEP_S > STANDING_LIMIT_S {
+            result.failure = Some(Failure::StoodStill);
+        }
+    }
+    result.time_s = simulation.time_s();
+    result.distance_m = simulation.progress_m.max(0.0);
+    result.laps_completed = ((result.distance_m / track.length_m + 1e-9) as usize).min(options.laps);
+    Ok(result)
+}
+
+/// Takes the driver's pictures.
+struct Eye<'a> {
+    track: &'a Track,
+    variant: Variant,
+    renderer: Renderer,
+    frame: RgbFrame,
+    jpeg: RoundTrip,
+}
+
+impl<'a> Eye<'a> {
+    fn new(track: &'a Track, seed: u64) -> Eye<'a> {
+        Eye {
+            track,
+            variant: Variant::new(track.world(), seed),
+            renderer: Renderer::default(),
+            frame: RgbFrame::default(),
+            jpeg: RoundTrip::default(),
+        }
+    }
+
+    fn look(&mut self, simulation: &Simulation) -> Result<&RgbFrame> {
+        let camera = Camera::new(&simulation.body_pose(), Mount::Center);
+        self.renderer.render(self.track.world(), &self.variant, &camera, Mount::Center, &mut self.frame);
+        self.jpeg.apply(&mut self.frame)?;
+        Ok(&self.frame)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn options(assisted: bool) -> RunOptions {
+        RunOptions { laps: 1, speed: Speed::Fixed(20.0), latency_ms: 0.0, noise: 0.0, assisted }
+    }
+
+    #[test]
+    fn the_expert_completes_a_lap_of_every_track_without_help() {
+        for name in ["lake", "mountain", "coast", "forest", "random:3"] {
+            let track = Track::load(name).unwrap();
+            for seed in 1..4 {
+                for assisted in [false, true] {
+                    let run = run(&track, &mut Expert, &options(assisted), seed).unwrap();
+                    assert_eq!((run.laps_completed, run.failure, run.interventions), (1, None, 0), "{name} {seed}");
+                    assert_eq!(run.autonomy_percent(), 100.0);
+                    assert!(run.moments.len() as f64 >= run.time_s * 20.0 - 1.0);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn without_steering_no_lap_is_completed_and_help_is_charged() {
+        for name in ["lake", "mountain", "coast", "forest"] {
+            let track = Track::load(name).unwrap();
+            for seed in 1..5 {
+                let free = run(&track, &mut Zero, &options(false), seed).unwrap();
+                assert!(free.laps_completed == 0 && free.failure.is_some(), "{name} {seed}");
+                let assisted = run(&track, &mut Zero, &options(true), seed).unwrap();
+                assert!(assisted.interventions > 5 && assisted.laps_completed == 1, "{name} {seed}");
+                let expected = 100.0 * (1.0 - 6.0 * assisted.interventions as f64 / assisted.time_s);
+                assert_eq!(assisted.autonomy_percent(), expected.max(0.0));
+                assert!(assisted.moments.iter().filter(|m| m.intervention).count() >= assisted.interventions - 1);
+            }
+        }
+    }
+
+    #[test]
+    fn a_driver_that_looks_sees_the_road_and_late_steering_is_worse() {
+        struct Looking(usize);
+        impl Driver for Looking {
+            fn steer(&mut self, frame: &RgbFrame, state: &DriveState) -> f32 {
+                self.0 += usize::from(frame.pixels.iter().any(|p| *p > 0));
+                Expert.steer(frame, state)
+            }
+        }
+        let track = Track::load("lake").unwrap();
+        let mut looking = Looking(0);
+        let seen = run(&track, &mut looking, &options(false), 2).unwrap();
+        assert_eq!(looking.0, seen.moments.len());
+        assert_eq!(seen, run(&track, &mut Expert, &options(false), 2).unwrap());
+        let spread = |options: RunOptions| {
+            let run = run(&track, &mut Expert, &options, 2).unwrap();
+            run.moments[100..].iter().map(|m| m.cte_m * m.cte_m).sum::<f64>() / (run.moments.len() - 100) as f64
+        };
+        let plain = spread(options(false));
+        assert!(spread(RunOptions { latency_ms: 700.0, ..options(false) }) > 1.1 * plain);
+        assert!(spread(RunOptions { noise: 0.1, ..options(false) }) > 1.1 * plain);
+    }
+}

@@ -1,0 +1,82 @@
+//! Holding a speed: the controller of Udacity's `drive.py`, in elapsed time instead of frames.
+
+use super::car::MPS_PER_MPH;
+use super::simulation::Simulation;
+
+/// Throttle for each mph of error.
+const PROPORTIONAL: f64 = 0.1;
+/// Throttle for each mph of error and second; `drive.py` adds 0.002 a frame, which is this at 20 frames a second.
+const INTEGRAL_PER_S: f64 = 0.04;
+/// Sideways acceleration that `Speed::Auto` allows itself in bends, m/s².
+const COMFORT_MPS2: f64 = 2.5;
+
+/// The speed a drive aims at.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Speed {
+    /// The same everywhere, mph.
+    Fixed(f64),
+    /// 30 mph, less before and in bends.
+    Auto,
+}
+
+impl Speed {
+    /// The speed to aim at here, mph.
+    pub fn target_mph(self, simulation: &Simulation) -> f64 {
+        match self {
+            Speed::Fixed(mph) => mph,
+            Speed::Auto => {
+                let sign = if simulation.reverse { -1.0 } else { 1.0 };
+                let sharpest = (0..=12)
+                    .map(|k| simulation.track.at(simulation.location.s_m + sign * f64::from(k) * 2.5).curvature.abs())
+                    .fold(0.0, f64::max);
+                ((COMFORT_MPS2 / sharpest.max(1e-6)).sqrt() / MPS_PER_MPH).clamp(9.0, 30.0)
+            }
+        }
+    }
+
+    /// The speed at which runs begin, m/s.
+    pub fn at_start_mps(self) -> f64 {
+        match self {
+            Speed::Fixed(mph) => mph * MPS_PER_MPH,
+            Speed::Auto => 12.0 * MPS_PER_MPH,
+        }
+    }
+}
+
+/// A proportional-integral controller from speed to throttle.
+#[derive(Clone, Debug, Default)]
+pub struct SpeedController {
+    /// Sum of error times time, mph s.
+    integral: f64,
+}
+
+impl SpeedController {
+    /// The throttle, [-1, 1], after `dt_s` more seconds at `speed_mph` where `target_mph` is wanted.
+    pub fn throttle(&mut self, target_mph: f64, speed_mph: f64, dt_s: f64) -> f64 {
+        let error = target_mph - speed_mph;
+        let limit = 1.0 / INTEGRAL_PER_S;
+        self.integral = (self.integral + error * dt_s).clamp(-limit, limit);
+        (PROPORTIONAL * error + INTEGRAL_PER_S * self.integral).clamp(-1.0, 1.0)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::car::{Car, Controls, STEP_S};
+    use super::*;
+
+    #[test]
+    fn the_speed_settles_at_the_target_from_rest_and_from_above_whatever_the_frame_rate() {
+        for (from_mph, every) in [(0.0, 1), (0.0, 5), (30.0, 2)] {
+            let mut car = Car::new(0.0, 0.0, 1.0, 0.0, from_mph * MPS_PER_MPH);
+            let (mut controller, mut throttle) = (SpeedController::default(), 0.0);
+            for step in 0..2000 {
+                if step % every == 0 {
+                    throttle = controller.throttle(20.0, car.speed_mps / MPS_PER_MPH, every as f64 * STEP_S);
+                }
+                car.step(Controls { steering: 0.0, throttle }, 0.0, 0.0);
+            }
+            assert!((car.speed_mps / MPS_PER_MPH - 20.0).abs() < 0.3, "{}", car.speed_mps / MPS_PER_MPH);
+        }
+    }
+}

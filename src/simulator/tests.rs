@@ -1,0 +1,271 @@
+//! Tests of the simulator as a whole.
+
+use std::fs;
+use std::path::Path;
+
+use sha2::{Digest, Sha256};
+
+use super::drive::trajectory_csv;
+use super::run::run;
+use super::spec::TrackSpec;
+use super::*;
+use crate::Error;
+
+fn lake_spec() -> TrackSpec {
+    toml::from_str(builtin::text("lake").unwrap()).unwrap()
+}
+
+fn refusal(spec: TrackSpec) -> String {
+    match Track::from_spec(spec, "my.toml") {
+        Ok(_) => panic!("the track was accepted"),
+        Err(error) => error.to_string(),
+    }
+}
+
+#[test]
+fn built_in_tracks_keep_their_promises() {
+    for (name, held_out, smallest_m) in
+        [("lake", false, 25.0), ("mountain", false, 15.0), ("coast", true, 25.0), ("forest", true, 25.0)]
+    {
+        let track = Track::load(name).unwrap();
+        assert_eq!((track.name(), track.held_out()), (name, held_out));
+        assert!((600.0..=1500.0).contains(&track.length_m));
+        let sharpest = track.stations.iter().map(|s| s.curvature.abs()).fold(0.0, f64::max);
+        assert!(1.0 / sharpest >= smallest_m, "{name}: {}", 1.0 / sharpest);
+    }
+    let widths = |name| Track::load(name).unwrap().stations.iter().map(|s| s.width_m).collect::<Vec<_>>();
+    assert!(widths("lake").iter().all(|w| (8.5..=9.5).contains(w)));
+    assert!(widths("mountain").iter().all(|w| (7.0..=8.0).contains(w)));
+}
+
+#[test]
+fn held_out_tracks_look_like_no_training_track() {
+    use super::spec::{Edge, Surface};
+    let reserved = |track: &Track| {
+        let looks = &track.spec.look;
+        let surface = looks.iter().any(|l| matches!(l.surface, Surface::Concrete | Surface::Gravel));
+        let edge = looks.iter().any(|l| [l.left, l.right].iter().any(|e| matches!(e, Edge::Dashes | Edge::Overgrown)));
+        (surface, edge)
+    };
+    for name in ["coast", "forest"] {
+        assert_eq!(reserved(&Track::load(name).unwrap()), (true, true));
+    }
+    for name in ["lake", "mountain"].into_iter().map(String::from).chain((0..20).map(|k| format!("random:{k}"))) {
+        assert_eq!(reserved(&Track::load(&name).unwrap()), (false, false), "{name}");
+    }
+}
+
+#[test]
+fn random_tracks_exist_for_every_seed_and_high_seeds_are_held_out() {
+    for seed in (0..40).chain(1_000_001..1_000_006) {
+        let track = Track::load(&format!("random:{seed}")).unwrap();
+        assert_eq!(track.held_out(), seed >= 1_000_000);
+        assert!(track.stations.iter().all(|s| s.curvature.abs() <= 1.0 / 25.0));
+    }
+    assert!(matches!(Track::load("random:x"), Err(Error::Usage(m)) if m.contains("seed")));
+}
+
+#[test]
+fn unknown_tracks_name_the_nearest() {
+    let Err(error) = Track::load("moutain") else { panic!("accepted") };
+    assert!(error.to_string().contains("did you mean `mountain`"), "{error}");
+    assert!(matches!(Track::load("nowhere/track.toml"), Err(Error::Io { .. })));
+}
+
+#[test]
+fn bad_track_files_are_refused_with_place_and_remedy() {
+    let eight = |i: usize| {
+        let a = i as f64 / 24.0 * std::f64::consts::TAU;
+        [170.0 * a.sin(), 90.0 * (2.0 * a).sin(), 3.0, 8.0, 0.0]
+    };
+    let crossing = refusal(TrackSpec { points: (0..24).map(eight).collect(), ..lake_spec() });
+    assert!(crossing.starts_with("my.toml: ") && crossing.contains("crosses or touches itself"), "{crossing}");
+
+    let mut tight = lake_spec();
+    let at = tight.points[5];
+    tight.points[6] = [at[0] + 3.0, at[1] + 3.0, 0.0, 9.0, 0.0];
+    tight.points[7] = [at[0] + 30.0, at[1] - 20.0, 0.0, 9.0, 0.0];
+    let tight = refusal(tight);
+    assert!(tight.contains("radius") && tight.contains("at least 25 m"), "{tight}");
+
+    let mut long = lake_spec();
+    long.points.iter_mut().for_each(|p| (p[0], p[1]) = (p[0] * 2.0, p[1] * 2.0));
+    assert!(refusal(long).contains("600 to 1500 m"));
+    assert!(refusal(TrackSpec { points: lake_spec().points[..4].to_vec(), ..lake_spec() }).contains("at least 6"));
+    let mut steep = lake_spec();
+    steep.points[3][2] = 60.0;
+    assert!(refusal(steep).contains("slope"));
+    let mut lost = lake_spec();
+    lost.stretch[1].look = Some("glass".to_string());
+    assert!(refusal(lost).contains("`glass`"));
+    let Err(error) = Track::from_toml("name = 3", "my.toml") else { panic!("accepted") };
+    assert!(error.to_string().starts_with("my.toml: "));
+}
+
+/// Hash of every file of a folder, names included, in the order of the names.
+fn hash_of(folder: &Path) -> String {
+    let mut hash = Sha256::new();
+    let mut paths: Vec<_> = fs::read_dir(folder).unwrap().map(|e| e.unwrap().path()).collect();
+    paths.sort();
+    for path in paths {
+        hash.update(path.file_name().unwrap().as_encoded_bytes());
+        if path.is_dir() {
+            hash.update(hash_of(&path));
+        } else {
+            hash.update(fs::read(&path).unwrap());
+        }
+    }
+    hash.finalize().iter().map(|b| format!("{b:02x}")).collect()
+}
+
+#[test]
+fn the_same_seed_gives_the_same_bytes_for_any_number_of_threads() {
+    let dir = tempfile::tempdir().unwrap();
+    let record_with = |threads, seed, name: &str| {
+        let track = Track::load("lake").unwrap();
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        let options = RecordOptions { laps: 0.03, seed, noise: 0.05, ..Default::default() };
+        let out = dir.path().join(name);
+        let info = pool.install(|| record(&track, &options, &out, &|_| true)).unwrap();
+        assert!(info.rows > 20);
+        hash_of(&out)
+    };
+    let first = record_with(1, 4, "first");
+    assert_eq!(first, record_with(3, 4, "second"));
+    assert_ne!(first, record_with(1, 5, "third"));
+}
+
+#[test]
+fn trajectories_repeat_to_the_bit() {
+    let options = RunOptions { laps: 1, speed: Speed::Auto, latency_ms: 60.0, noise: 0.05, assisted: true };
+    let drive = |seed| trajectory_csv(&run(&Track::load("random:5").unwrap(), &mut Expert, &options, seed).unwrap());
+    assert_eq!(drive(8), drive(8));
+    assert_ne!(drive(8), drive(9));
+}
+
+#[test]
+fn recordings_have_the_format_of_udacitys_simulator() {
+    let dir = tempfile::tempdir().unwrap();
+    let track = Track::load("coast").unwrap();
+    let sample = RecordOptions { laps: 0.01, ..Default::default() };
+    let out = dir.path().join("new/sample");
+    record(&track, &sample, &out, &|_| true).unwrap();
+    let text = fs::read_to_string(out.join("driving_log.csv")).unwrap();
+    let mut lines = text.lines();
+    assert_eq!(lines.next(), Some("center,left,right,steering,throttle,brake,speed"));
+    for line in lines {
+        let fields: Vec<&str> = line.split(", ").collect();
+        assert_eq!(fields.len(), 7);
+        for (field, mount) in fields.iter().zip(Mount::ALL) {
+            assert!(field.starts_with(&format!("IMG/{}_2026_01_01_", mount.name())), "{field}");
+            let picture = image::open(out.join(field)).unwrap();
+            assert_eq!((picture.width(), picture.height()), (320, 160));
+        }
+        let steering: f64 = fields[3].parse().unwrap();
+        assert!((-1.0..=1.0).contains(&steering));
+    }
+    let side: toml::Table = fs::read_to_string(out.join("recording.toml")).unwrap().parse().unwrap();
+    assert_eq!(side["held_out"].as_bool(), Some(true));
+    assert_eq!(side["rows"].as_integer(), Some(text.lines().count() as i64 - 1));
+
+    let before = hash_of(&out);
+    let refused = record(&track, &sample, &out, &|_| true).unwrap_err().to_string();
+    assert!(refused.contains("exists already"), "{refused}");
+    assert_eq!(before, hash_of(&out));
+
+    let v2 = dir.path().join("v2");
+    record(&track, &RecordOptions { format: LogFormat::V2, ..sample.clone() }, &v2, &|_| true).unwrap();
+    let text = fs::read_to_string(v2.join("driving_log.csv")).unwrap();
+    let first: Vec<&str> = text.lines().next().unwrap().split(',').collect();
+    assert!(first.len() == 7 && Path::new(first[0]).is_absolute() && Path::new(first[0]).exists());
+
+    let stopped = record(&track, &sample, &dir.path().join("stopped"), &|_| false);
+    assert!(matches!(stopped, Err(Error::Interrupted)));
+}
+
+/// Mean brightness of a rectangle of a picture.
+fn brightness(frame: &RgbFrame, columns: std::ops::Range<usize>, rows: std::ops::Range<usize>) -> f64 {
+    let n = (columns.len() * rows.len() * 3) as f64;
+    let sum: u64 = rows
+        .flat_map(|r| columns.clone().map(move |c| (r * WIDTH + c) * 3))
+        .flat_map(|at| &frame.pixels[at..at + 3])
+        .map(|p| u64::from(*p))
+        .sum();
+    sum as f64 / n
+}
+
+#[test]
+fn a_picture_shows_sky_above_road_and_the_centre_line_where_it_is() {
+    let track = Track::load("mountain").unwrap();
+    let world = track.world();
+    let (mut renderer, mut frame) = (Renderer::default(), RgbFrame::default());
+    let mut seen = 0;
+    for place in 0..80 {
+        let start = Start { s_m: place as f64 * 10.0, reverse: false, offset_m: 1.5, heading_deg: 0.0 };
+        let body = Simulation::new(&track, start, 9.0).body_pose();
+        let camera = Camera::new(&body, Mount::Center);
+        renderer.render(world, &Variant::new(world, 0), &camera, Mount::Center, &mut frame);
+        // A dash of the centre line 7 m ahead, if there is one, and the asphalt a metre beside it.
+        let s = track.at(start.s_m + 7.0);
+        let point = |right: f64| {
+            let p = math::vec3(
+                (s.x + s.ty * right) as f32,
+                (s.y - s.tx * right) as f32,
+                (s.z - s.crossfall * right) as f32,
+            );
+            camera.project(p).unwrap()
+        };
+        let at = |right: f64| {
+            let (column, row) = point(right);
+            brightness(&frame, column as usize - 1..column as usize + 2, row as usize..row as usize + 1)
+        };
+        let along = (start.s_m + 7.0) * world.road_length_m as f64 / track.length_m;
+        let phase = (along + f64::from(Variant::new(world, 0).road_shift_m)).rem_euclid(12.0);
+        // Not where the edge of a shadow or a repaired patch runs beside the line.
+        let even = at(1.0).min(at(-1.0)) > 0.9 * at(1.0).max(at(-1.0));
+        if world.road[track.locate(s.x, s.y).station].look != 0 || !even {
+            continue;
+        }
+        if (1.0..3.5).contains(&phase) {
+            assert!(at(0.0) > 1.12 * at(1.0).max(at(-1.0)), "{place}: {} {} {}", at(0.0), at(1.0), at(-1.0));
+            seen += 1;
+        } else if (6.0..10.5).contains(&phase) {
+            assert!(at(0.0) < 1.12 * at(1.0).max(at(-1.0)), "{place}");
+        }
+    }
+    assert!(seen >= 5, "{seen}");
+}
+
+#[test]
+fn a_crest_hides_the_road_behind_it() {
+    let mut spec = lake_spec();
+    spec.land.water_level_m = None;
+    spec.land.hills_m = 0.0;
+    spec.land.plants.clear();
+    spec.stretch.clear();
+    // How much nearer than a point of the road, 35 m behind the top, is what covers its pixel from 30 m before the top.
+    let hidden_m = |hump_m: f64| {
+        let mut spec = spec.clone();
+        spec.points[3][2] = hump_m;
+        let track = Track::from_spec(spec, "hump").unwrap();
+        let top = (100..160).max_by(|a, b| track.stations[*a].z.total_cmp(&track.stations[*b].z)).unwrap();
+        let start = Start { s_m: track.s_of(top) - 30.0, reverse: false, offset_m: 0.0, heading_deg: 0.0 };
+        let body = Simulation::new(&track, start, 9.0).body_pose();
+        let camera = Camera::new(&body, Mount::Center);
+        let (mut renderer, mut frame) = (Renderer::default(), RgbFrame::default());
+        renderer.render(track.world(), &Variant::new(track.world(), 0), &camera, Mount::Center, &mut frame);
+        let behind = track.stations[top + 35];
+        let point = math::vec3(behind.x as f32, behind.y as f32, behind.z as f32);
+        let (column, row) = camera.project(point).unwrap();
+        camera.view(point).z - renderer.depth_m(column as usize, row as usize)
+    };
+    assert!(hidden_m(0.0).abs() < 6.0, "{}", hidden_m(0.0));
+    assert!(hidden_m(8.0) > 15.0, "{}", hidden_m(8.0));
+}
+
+#[test]
+fn a_contact_sheet_holds_every_picture() {
+    let sheet = contact_sheet(&Track::load("forest").unwrap(), 2, 3, false, 0);
+    assert_eq!((sheet.width(), sheet.height()), (2 * 324, 3 * 164));
+    assert!(sheet.get_pixel(100, 100) != sheet.get_pixel(424, 264));
+}
