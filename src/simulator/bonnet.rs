@@ -68,8 +68,8 @@ impl Bonnet {
     pub(super) fn draw(&self, mount: Mount, variant: &Variant, frame: &mut RgbFrame) {
         let pixels = &self.0[Mount::ALL.iter().position(|m| *m == mount).unwrap_or(0)];
         for (at, rgb) in pixels {
-            for c in 0..3 {
-                frame.pixels[at + c] = variant.tone[c][usize::from(rgb[c])];
+            for ((out, tone), value) in frame.pixels[*at..at + 3].iter_mut().zip(&variant.tone).zip(rgb) {
+                *out = tone[usize::from(*value)];
             }
         }
     }

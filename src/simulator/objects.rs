@@ -2,7 +2,7 @@
 
 use super::camera::{FOCAL_PX, HEIGHT, RgbFrame, WIDTH};
 use super::math::{Vec3, hash2, lerp};
-use super::renderer::View;
+use super::renderer::{View, lit};
 use super::spec::Wall;
 use super::world::{Sprite, WallPiece};
 
@@ -37,7 +37,8 @@ fn draw_sprite(depths: &mut [f32], view: &View, sprite: &Sprite, frame: &mut Rgb
     if top >= bottom || high < 0.7 {
         return;
     }
-    let (texels, w, h) = picture.level(high);
+    let level = picture.level(high);
+    let (w, h) = (level.width, level.height);
     let light = (sprite.light * 256.0).min(256.0) as u32;
     let (inverse, haze) = (1.0 / foot.z, view.air(foot.z));
     let (du, dv) = (w as f32 / wide, h as f32 / high);
@@ -47,20 +48,20 @@ fn draw_sprite(depths: &mut [f32], view: &View, sprite: &Sprite, frame: &mut Rgb
         let above = y - (row as f32 + 0.5);
         let v = ((high - above) * dv).clamp(0.0, h as f32 - 1.0) as usize;
         let left = x + above * lean - wide / 2.0;
-        let first = (left + 0.5).max(0.0) as usize;
-        let last = ((left + wide + 0.5).max(0.0) as usize).min(WIDTH);
+        let (from, to) = level.solid[v];
+        let (from, to) = if sprite.mirrored { (w - to, w - from) } else { (from, to) };
+        let first = (left + from as f32 / du + 0.5).max(0.0) as usize;
+        let last = ((left + to as f32 / du + 0.5).max(0.0) as usize).min(WIDTH);
         for column in first..last {
             let at = row * WIDTH + column;
             if depths[at] > inverse {
                 continue;
             }
             let u = (((column as f32 + 0.5 - left) * du).max(0.0) as usize).min(w - 1);
-            let texel = texels[v * w + if sprite.mirrored { w - 1 - u } else { u }];
+            let texel = level.texels[v * w + if sprite.mirrored { w - 1 - u } else { u }];
             if texel >> 31 == 1 {
                 depths[at] = inverse;
-                let red_blue = ((texel & 0x00ff_00ff) * light >> 8) & 0x00ff_00ff;
-                let green = (texel >> 8 & 255) * light >> 8;
-                view.finish(red_blue | green << 8, haze, &mut frame.pixels[3 * at..3 * at + 3]);
+                view.finish(lit(texel, light), haze, &mut frame.pixels[3 * at..3 * at + 3]);
             }
         }
     }

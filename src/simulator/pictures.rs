@@ -12,21 +12,44 @@ const H: usize = 128;
 /// One thing's picture: texels `0xAABBGGRR`, alpha at or above 128 is solid.
 pub struct Picture {
     /// Finest first; each half as wide and high as the one before.
-    levels: Vec<Vec<u32>>,
+    levels: Vec<PictureLevel>,
     /// Width of the thing, m.
     pub width_m: f32,
     /// Height of the thing, m.
     pub height_m: f32,
 }
 
+/// A picture at one size.
+pub struct PictureLevel {
+    /// Row by row from the top.
+    pub texels: Vec<u32>,
+    /// Texels of a row.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+    /// For each row the first solid texel and the one after the last; equal where none is.
+    pub solid: Vec<(usize, usize)>,
+}
+
+impl PictureLevel {
+    fn new(texels: Vec<u32>, width: usize, height: usize) -> PictureLevel {
+        let extent = |row: &[u32]| {
+            let solid = |t: &u32| t >> 31 == 1;
+            row.iter().position(solid).map_or((0, 0), |first| (first, row.iter().rposition(solid).unwrap_or(first) + 1))
+        };
+        let solid = texels.chunks_exact(width).map(extent).collect();
+        PictureLevel { texels, width, height, solid }
+    }
+}
+
 impl Picture {
-    /// Texels, width and height of the level fit for a thing `pixels` high in the picture.
-    pub fn level(&self, pixels: f32) -> (&[u32], usize, usize) {
+    /// The level fit for a thing `pixels` high in the picture.
+    pub fn level(&self, pixels: f32) -> &PictureLevel {
         let mut k = 0;
         while k + 1 < self.levels.len() && (H >> k) as f32 > pixels * 1.5 {
             k += 1;
         }
-        (&self.levels[k], W >> k, H >> k)
+        &self.levels[k]
     }
 
     /// Paints a plant; `variant` changes details.
@@ -62,11 +85,13 @@ impl Picture {
                     let four = [0, 1, 2 * w, 2 * w + 1].map(|o| fine[2 * v * 2 * w + 2 * u + o]);
                     let weight: u32 = four.iter().map(|t| t >> 24).sum();
                     let channel = |s: u32| four.iter().map(|t| (t >> s & 255) * (t >> 24)).sum::<u32>() / weight.max(1);
-                    channel(0) | channel(8) << 8 | channel(16) << 16 | (weight / 4) << 24
+                    channel(0) | channel(8) << 8 | channel(16) << 16 | (weight / 3).min(255) << 24
                 })
                 .collect();
             levels.push(coarse);
         }
+        let levels =
+            levels.into_iter().enumerate().map(|(k, texels)| PictureLevel::new(texels, W >> k, H >> k)).collect();
         Picture { levels, width_m, height_m }
     }
 }

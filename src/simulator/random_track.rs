@@ -37,7 +37,7 @@ fn line(rng: &mut Rng) -> Vec<[f64; 5]> {
     let n = 16 + rng.below(9);
     let lap_m = rng.between(720.0, 1250.0);
     let rough = rng.between(0.12, 0.38);
-    let (phase, lobes) = (rng.between(0.0, 6.28), 2.0 + rng.below(3) as f64);
+    let (phase, lobes) = (rng.between(0.0, std::f64::consts::TAU), 2.0 + rng.below(3) as f64);
     let (climb, waves) = (rng.between(0.0, 6.0) * rng.unit(), 1.0 + rng.below(3) as f64);
     let width = rng.between(6.8, 9.6);
     let bank = rng.between(0.0, 4.0);

@@ -30,6 +30,17 @@ const FARTHEST_M: f32 = 380.0;
 /// Land this near takes the light at its very place, smoothly; farther the light of a texel of the map, m.
 const SMOOTH_LIGHT_M: f32 = 45.0;
 
+/// Red and blue of a packed colour.
+const RED_BLUE: u32 = 0x00ff_00ff;
+/// Places across, fixed-point, between which every road covers the land wholly: 3.6 of 4 m to either side.
+const PAVED: (i32, i32) = (((HALF_M - 3.6) * ACROSS_UNITS_PER_M) as i32, ((HALF_M + 3.6) * ACROSS_UNITS_PER_M) as i32);
+
+/// A packed colour in `light` of 256; red and blue are computed in one word, green in another.
+#[inline(always)]
+pub(super) fn lit(colour: u32, light: u32) -> u32 {
+    ((((colour & RED_BLUE) * light) >> 8) & RED_BLUE) | (((colour >> 8 & 255) * light) & 0xff00)
+}
+
 /// Takes pictures; keeps its buffers from one to the next.
 pub struct Renderer {
     /// Inverse depth (1/m) at each row and marched column; 0 = sky.
@@ -103,6 +114,8 @@ struct Place {
     y: i32,
     along: i32,
     across: i32,
+    /// Light in units of `1 / SPAN`, or 0 where the land's map is to tell.
+    light: i32,
 }
 
 impl Renderer {
@@ -268,7 +281,8 @@ impl View<'_> {
         if a.inverse > 1.2 * b.inverse || b.inverse > 1.2 * a.inverse {
             return None;
         }
-        if !a.near_road && !b.near_road {
+        let road = |spot: &Spot| spot.near_road && (spot.across as u32) < ACROSS_UNITS;
+        if a.near_road != b.near_road && !road(a) && !road(b) || !a.near_road && !b.near_road {
             return Some(0);
         }
         if a.near_road != b.near_road || a.look != b.look {
@@ -312,45 +326,64 @@ impl View<'_> {
         let (dx, dy) = ((b.x - a.x) / SPAN as i32, (b.y - a.y) / SPAN as i32);
         let (du, dv) = ((b.along + lap - a.along) / SPAN as i32, (b.across - a.across) / SPAN as i32);
         let di = (b.inverse - a.inverse) * (1.0 / SPAN as f32);
-        let mut place = Place { x: a.x, y: a.y, along: a.along, across: a.across };
+        // Light where it is known at both ends, in 1/8 of its steps.
+        let dl = if a.light != 0 && b.light != 0 { b.light as i32 - a.light as i32 } else { 0 };
         let mut inverse = a.inverse;
-        for (out, depth) in out.chunks_exact_mut(3).zip(depths) {
+        for depth in depths {
             *depth = inverse;
-            self.put(place, a, levels, out);
             inverse += di;
-            place = Place { x: place.x + dx, y: place.y + dy, along: place.along + du, across: place.across + dv };
+        }
+        let mut place = Place { x: a.x, y: a.y, along: a.along, across: a.across, light: a.light as i32 * SPAN as i32 };
+        let near_road = a.near_road && b.near_road;
+        let paved = |spot: &Spot| near_road && spot.light != 0 && (PAVED.0..PAVED.1).contains(&spot.across);
+        if paved(a) && paved(b) {
+            // Half of all ground: nothing but the road's own surface.
+            for out in out.chunks_exact_mut(3) {
+                let texel = levels.road.fetch(place.along, place.across as u32);
+                self.finish(lit(texel, place.light as u32 / SPAN as u32), levels.air, out);
+                place.along += du;
+                place.across += dv;
+                place.light += dl;
+            }
+            return;
+        }
+        for out in out.chunks_exact_mut(3) {
+            self.put(place, near_road, levels, out);
+            place.x += dx;
+            place.y += dy;
+            place.along += du;
+            place.across += dv;
+            place.light += dl;
         }
     }
 
-    /// Colours one pixel of ground. Red and blue are computed in one word, green in another.
+    /// Colours one pixel of ground.
     #[inline(always)]
-    fn put(&self, place: Place, spot: &Spot, levels: &Levels, out: &mut [u8]) {
-        const RED_BLUE: u32 = 0x00ff_00ff;
+    fn put(&self, place: Place, near_road: bool, levels: &Levels, out: &mut [u8]) {
         let mut texel = 0;
-        if spot.near_road && (place.across as u32) < ACROSS_UNITS {
+        if near_road && (place.across as u32) < ACROSS_UNITS {
             texel = levels.road.fetch(place.along, place.across as u32);
         }
-        let (mut light, mut land) = (spot.light, 0);
+        let (mut light, mut land) = (place.light as u32 / SPAN as u32, 0);
         if texel >> 24 != 255 || light == 0 {
             land = levels.ground.fetch(place.x, place.y);
             if light == 0 {
                 light = u32::from(self.variant.road_light[(land >> 24) as usize]);
             }
         }
-        let mut red_blue = ((texel & RED_BLUE) * light >> 8) & RED_BLUE;
-        let mut green = (texel >> 8 & 255) * light >> 8;
+        let mut colour = lit(texel, light);
         if texel >> 24 != 255 {
             let alpha = texel >> 24;
-            red_blue = (red_blue * alpha + (land & RED_BLUE) * (256 - alpha)) >> 8 & RED_BLUE;
-            green = (green * alpha + (land >> 8 & 255) * (256 - alpha)) >> 8;
+            let red_blue = ((colour & RED_BLUE) * alpha + (land & RED_BLUE) * (256 - alpha)) >> 8 & RED_BLUE;
+            let green = ((colour >> 8 & 255) * alpha + (land >> 8 & 255) * (256 - alpha)) >> 8;
+            colour = red_blue | green << 8;
         }
-        self.finish(red_blue | green << 8, levels.air, out);
+        self.finish(colour, levels.air, out);
     }
 
     /// Adds air and the light of the run, and writes the pixel. `colour` is `0x__BBGGRR`.
     #[inline(always)]
     pub(super) fn finish(&self, colour: u32, air: u32, out: &mut [u8]) {
-        const RED_BLUE: u32 = 0x00ff_00ff;
         let (mut red_blue, mut green) = (colour & RED_BLUE, colour >> 8 & 255);
         if air > 3 {
             let haze = self.variant.haze;
@@ -399,8 +432,9 @@ impl View<'_> {
             // On level ground inverse depth grows with the fall of the ray.
             let fall = (self.camera.up.z / FOCAL_PX / (ray.z - 1e-3).abs()).min(1.0) * spot.inverse;
             let levels = self.levels(&spot, fall);
-            let place = Place { x: spot.x, y: spot.y, along: spot.along, across: spot.across };
-            self.put(place, &spot, &levels, out);
+            let Spot { x, y, along, across, light, .. } = spot;
+            let place = Place { x, y, along, across, light: light as i32 * SPAN as i32 };
+            self.put(place, spot.near_road, &levels, out);
         }
     }
 }

@@ -210,7 +210,7 @@ impl<'a> Scenery<'a> {
     }
 
     /// Distance from the edge of the nearest road, m; `None` far from any road.
-    fn from_edge(&self, x: f32, y: f32) -> Option<f32> {
+    fn distance_from_edge(&self, x: f32, y: f32) -> Option<f32> {
         let station = self.terrain.station_at_grid(x - self.terrain.x0, y - self.terrain.y0);
         (station != NO_STATION).then(|| {
             let s = &self.track.stations[usize::from(station)];
@@ -254,7 +254,7 @@ impl<'a> Scenery<'a> {
             let (variant, scale, mirrored) = (rng.below(VARIANTS), rng.between(0.7, 1.25), rng.unit() < 0.5);
             let (x, y) = (x as f32, y as f32);
             let least = if k < near { land.plants_from_m } else { 20.0 };
-            if self.from_edge(x, y).is_none_or(|e| e >= least) {
+            if self.distance_from_edge(x, y).is_none_or(|e| e >= least) {
                 let picture = self.pictures_of(plant) + variant;
                 self.stand(x, y, picture, scale as f32, mirrored);
             }
