@@ -20,7 +20,8 @@ use crate::recipe::Recipe;
 const FORMAT: u32 = 1;
 const METADATA_KEY: &str = "steersman";
 const TRAINING_ROWS: &str = "training_rows";
-const LABEL: &str = "steering in [-1, 1], positive to the right; times recipe.full_lock_deg it is degrees of the front wheels";
+const LABEL: &str =
+    "steering in [-1, 1], positive to the right; times recipe.full_lock_deg it is degrees of the front wheels";
 
 /// A network with its numbers and its story.
 #[derive(Clone, Debug, PartialEq)]
@@ -114,8 +115,7 @@ impl Model {
         let network = recipe.network(Isa::PORTABLE)?;
         let parameters = read_parameters(path, &network, &tensors, "")?;
         let rows = find(path, &tensors, TRAINING_ROWS, Dtype::U64)?;
-        let training_rows =
-            rows.data().as_chunks::<8>().0.iter().map(|bytes| u64::from_le_bytes(*bytes)).collect();
+        let training_rows = rows.data().as_chunks::<8>().0.iter().map(|bytes| u64::from_le_bytes(*bytes)).collect();
         Ok(Model { recipe, parameters, record: metadata.training, training_rows })
     }
 }
@@ -189,7 +189,8 @@ pub(crate) fn write_tensors(path: &Path, tensors: &[StoredTensor], metadata: Str
 
 /// Tensors and metadata of a safetensors file of ours.
 pub(crate) fn read_tensors<'a>(path: &Path, bytes: &'a [u8]) -> Result<(SafeTensors<'a>, String)> {
-    let damaged = |e: safetensors::SafeTensorError| Error::data(path, format!("is no safetensors file, or is damaged: {e}"));
+    let damaged =
+        |e: safetensors::SafeTensorError| Error::data(path, format!("is no safetensors file, or is damaged: {e}"));
     let (_, header) = SafeTensors::read_metadata(bytes).map_err(damaged)?;
     let tensors = SafeTensors::deserialize(bytes).map_err(damaged)?;
     let metadata = header.metadata().as_ref().and_then(|info| info.get(METADATA_KEY)).cloned();

@@ -155,7 +155,11 @@ mod tests {
             let mut pilot = pilot(name);
             let first = pilot.steer(160, 320, &usual).unwrap();
             assert!(pilot.steer(120, 160, &small).unwrap().is_finite());
-            assert_eq!(pilot.steer(160, 320, &usual).unwrap(), first, "{name}: an image must not depend on earlier ones");
+            assert_eq!(
+                pilot.steer(160, 320, &usual).unwrap(),
+                first,
+                "{name}: an image must not depend on earlier ones"
+            );
         }
     }
 

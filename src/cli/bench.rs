@@ -68,7 +68,10 @@ pub fn run(args: BenchArgs, started: Instant) -> Result<()> {
     }
     let share = 100.0 * result.train_gflops / result.peak_gflops;
     println!("{}, batch {}, {} threads, {}", recipe.name, args.batch, result.threads, result.isa);
-    println!("training      {:>9.0} images/s   {:.1} GFLOP/s, {share:.1} % of {:.0}", result.train_images_per_second, result.train_gflops, result.peak_gflops);
+    println!(
+        "training      {:>9.0} images/s   {:.1} GFLOP/s, {share:.1} % of {:.0}",
+        result.train_images_per_second, result.train_gflops, result.peak_gflops
+    );
     println!("prediction    {:>9.0} images/s", result.infer_images_per_second);
     println!("one image     {:>9.0} us median  {:.0} us p99 (1 thread)", result.infer_us_p50, result.infer_us_p99);
     println!("first step    {:>9.3} s after the start", result.first_step_s);

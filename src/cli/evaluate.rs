@@ -65,7 +65,12 @@ pub fn run(args: EvaluateArgs) -> Result<()> {
     println!("R2                         {}", or_dash(metrics.r2, 3));
     println!("MAE                        {:.2} deg", metrics.mae_deg);
     println!("RMSE                       {:.2} deg", metrics.rmse_deg);
-    println!("MAE left/straight/right    {} / {} / {} deg", or_dash(metrics.mae_left_deg, 2), or_dash(metrics.mae_straight_deg, 2), or_dash(metrics.mae_right_deg, 2));
+    println!(
+        "MAE left/straight/right    {} / {} / {} deg",
+        or_dash(metrics.mae_left_deg, 2),
+        or_dash(metrics.mae_straight_deg, 2),
+        or_dash(metrics.mae_right_deg, 2)
+    );
     println!("bias                       {:+.2} deg", metrics.bias_deg);
     println!("whiteness                  {} deg/s", or_dash(metrics.whiteness_deg_s, 1));
     Ok(())

@@ -84,10 +84,7 @@ impl Layer for BatchNorm {
 
     fn statistics(&self) -> Vec<ParamSpec> {
         let c = self.shape.c;
-        vec![
-            ParamSpec::constant("running_mean", vec![c], 0.0),
-            ParamSpec::constant("running_variance", vec![c], 1.0),
-        ]
+        vec![ParamSpec::constant("running_mean", vec![c], 0.0), ParamSpec::constant("running_variance", vec![c], 1.0)]
     }
 
     fn scratch_len(&self, _n: usize) -> usize {
@@ -138,14 +135,7 @@ impl BatchStatistics for BatchNorm {
         norm::channel_sums(self.isa, n, self.shape.c, self.shape.positions(), x, sums);
     }
 
-    fn finish_forward(
-        &self,
-        params: &[f32],
-        images: usize,
-        sums: &[f64],
-        moments: &mut [f32],
-        statistics: &mut [f32],
-    ) {
+    fn finish_forward(&self, params: &[f32], images: usize, sums: &[f64], moments: &mut [f32], statistics: &mut [f32]) {
         let c = self.shape.c;
         let count = (images * self.shape.positions()) as f64;
         let (gamma, beta) = params.split_at(c);

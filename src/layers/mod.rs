@@ -71,7 +71,13 @@ impl ParamSpec {
 
     /// A tensor that starts with the same `value` everywhere and does not decay.
     pub fn constant(name: &'static str, shape: Vec<usize>, value: f32) -> ParamSpec {
-        ParamSpec { name, shape, init: Initializer::Constant(value), fans: Fans { fan_in: 1, fan_out: 1 }, decays: false }
+        ParamSpec {
+            name,
+            shape,
+            init: Initializer::Constant(value),
+            fans: Fans { fan_in: 1, fan_out: 1 },
+            decays: false,
+        }
     }
 
     /// How many numbers the tensor has.
@@ -193,14 +199,7 @@ pub trait BatchStatistics {
 
     /// From the sums over all `images` of the batch: what [`Layer::forward`] needs into `moments`, and the running
     /// statistics moved on.
-    fn finish_forward(
-        &self,
-        params: &[f32],
-        images: usize,
-        sums: &[f64],
-        moments: &mut [f32],
-        statistics: &mut [f32],
-    );
+    fn finish_forward(&self, params: &[f32], images: usize, sums: &[f64], moments: &mut [f32], statistics: &mut [f32]);
 
     /// Overwrites `sums` with the sums over the `n` images of `x` and `dy`, and adds the gradients of the parameters that
     /// follow from them to `dparams`.

@@ -93,9 +93,8 @@ impl Network {
         for (index, spec) in specs.iter().enumerate() {
             let same_kind = specs[..index].iter().filter(|other| other.base_name() == spec.base_name()).count();
             let name = format!("{}{}", spec.base_name(), same_kind + 1);
-            let layer = spec
-                .build(network.output(), isa)
-                .map_err(|message| Error::Network { layer: name.clone(), message })?;
+            let layer =
+                spec.build(network.output(), isa).map_err(|message| Error::Network { layer: name.clone(), message })?;
             let (params_start, statistics_start) = (params_end, statistics_end);
             for (specs, end, trainable) in
                 [(layer.params(), &mut params_end, true), (layer.statistics(), &mut statistics_end, false)]
@@ -115,7 +114,10 @@ impl Network {
             });
         }
         if network.layers.is_empty() {
-            return Err(Error::Network { layer: "(none)".into(), message: "a network needs at least one layer".into() });
+            return Err(Error::Network {
+                layer: "(none)".into(),
+                message: "a network needs at least one layer".into(),
+            });
         }
         Ok(network)
     }

@@ -4,7 +4,8 @@ use serde::{Deserialize, Serialize};
 use steersman_kernels::Isa;
 
 use crate::layers::{
-    AveragePool, BatchNorm, Conv2d, Crop, Dense, Dropout, Elu, Flatten, Layer, MaxPool, PRelu, Padding, Relu, Scale, Slopes,
+    AveragePool, BatchNorm, Conv2d, Crop, Dense, Dropout, Elu, Flatten, Layer, MaxPool, PRelu, Padding, Relu, Scale,
+    Slopes,
 };
 use crate::tensor::{Initializer, Shape};
 

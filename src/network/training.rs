@@ -99,9 +99,9 @@ impl TrainingPlan {
         let ends = segment_starts[1..].iter().copied().chain([layers.len()]);
         let segments: Vec<_> = segment_starts.iter().copied().zip(ends).map(|(start, end)| start..end).collect();
 
-        let source: Vec<Option<usize>> = (0..layers.len()).map(|i| (0..i).rev().find(|&j| !is_view(&layers[j]))).collect();
-        let activations_len =
-            |layer: &NamedLayer| if is_view(layer) { 0 } else { layer.layer.output().len() };
+        let source: Vec<Option<usize>> =
+            (0..layers.len()).map(|i| (0..i).rev().find(|&j| !is_view(&layers[j]))).collect();
+        let activations_len = |layer: &NamedLayer| if is_view(layer) { 0 } else { layer.layer.output().len() };
         let per_image: usize = layers.iter().map(activations_len).sum();
         let largest = layers.iter().map(|l| l.layer.input().len().max(l.layer.output().len())).max().unwrap_or(0);
 

@@ -300,13 +300,25 @@ mod tests {
     #[test]
     fn momentum_is_the_weight_of_the_old_velocity() {
         // Velocities −0.1 and −0.1 − 0.9 · 0.1.
-        approx::assert_relative_eq!(after(sgd_spec(0.9, 0.0, 0.0), None, 1.0, 2)[0], 1.0 - 0.1 - 0.19, max_relative = 1e-6);
+        approx::assert_relative_eq!(
+            after(sgd_spec(0.9, 0.0, 0.0), None, 1.0, 2)[0],
+            1.0 - 0.1 - 0.19,
+            max_relative = 1e-6
+        );
     }
 
     #[test]
     fn a_long_gradient_is_clipped_to_the_norm_and_a_short_one_is_not() {
         let norm = (network().count(true) as f64).sqrt();
-        approx::assert_relative_eq!(after(sgd_spec(0.0, 0.0, 0.0), Some(norm / 4.0), 1.0, 1)[0], 0.975, max_relative = 1e-6);
-        approx::assert_relative_eq!(after(sgd_spec(0.0, 0.0, 0.0), Some(norm * 4.0), 1.0, 1)[0], 0.9, max_relative = 1e-6);
+        approx::assert_relative_eq!(
+            after(sgd_spec(0.0, 0.0, 0.0), Some(norm / 4.0), 1.0, 1)[0],
+            0.975,
+            max_relative = 1e-6
+        );
+        approx::assert_relative_eq!(
+            after(sgd_spec(0.0, 0.0, 0.0), Some(norm * 4.0), 1.0, 1)[0],
+            0.9,
+            max_relative = 1e-6
+        );
     }
 }

@@ -100,7 +100,9 @@ impl ScheduleSpec {
         };
         match self.shape {
             Schedule::Constant => Ok(()),
-            Schedule::TimeDecay { decay_per_update } if decay_per_update.is_finite() && decay_per_update >= 0.0 => Ok(()),
+            Schedule::TimeDecay { decay_per_update } if decay_per_update.is_finite() && decay_per_update >= 0.0 => {
+                Ok(())
+            }
             Schedule::TimeDecay { decay_per_update } => {
                 Err(format!("decay_per_update must not be negative or infinite, but is {decay_per_update}"))
             }

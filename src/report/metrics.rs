@@ -67,9 +67,8 @@ impl Metrics {
         let label_variance = mean(&mut labels().map(|l| (l - label_mean).powi(2)));
         let label_square = mean(&mut labels().map(|l| l * l));
         let neighbours = predictions.windows(2).filter(|w| w[0].session == w[1].session && w[1].time_s > w[0].time_s);
-        let rates = neighbours.map(|w| {
-            f64::from(w[1].steering - w[0].steering) * full_lock_deg / (w[1].time_s - w[0].time_s)
-        });
+        let rates =
+            neighbours.map(|w| f64::from(w[1].steering - w[0].steering) * full_lock_deg / (w[1].time_s - w[0].time_s));
         Some(Metrics {
             rows: predictions.len(),
             mse,
@@ -114,7 +113,11 @@ mod tests {
         let variance = squares / 4.0 - 0.005f64.powi(2);
         assert_relative_eq!(m.r2.unwrap(), 1.0 - 0.02 / variance, max_relative = 1e-6);
         // 5.5° and 9.5° within 0.1 s each; the last row is another session.
-        assert_relative_eq!(m.whiteness_deg_s.unwrap(), ((55f64.powi(2) + 95f64.powi(2)) / 2.0).sqrt(), max_relative = 1e-5);
+        assert_relative_eq!(
+            m.whiteness_deg_s.unwrap(),
+            ((55f64.powi(2) + 95f64.powi(2)) / 2.0).sqrt(),
+            max_relative = 1e-5
+        );
     }
 
     #[test]

@@ -8,10 +8,10 @@ use serde::{Deserialize, Serialize};
 use steersman_kernels::Isa;
 
 use super::checkpoint::{Progress, State};
+use super::data::Data;
 use super::history::{EpochRecord, write_history};
 use super::run_folder::{RunFolder, RunInfo};
 use super::validation::{Validation, ValidationResult};
-use super::data::Data;
 use crate::dataset::loader::{Batch, Loader};
 use crate::error::{Error, Result};
 use crate::model_file::{Model, TrainingRecord, weights_hash};
@@ -394,9 +394,10 @@ impl Session {
         let progress = &self.state.progress;
         let best = progress.history[progress.best_epoch as usize - 1];
         let last = progress.history[progress.history.len() - 1];
-        let (images, seconds) = progress.history.iter().fold((0, 0.0), |(images, seconds), epoch| {
-            (images + epoch.images, seconds + epoch.train_seconds)
-        });
+        let (images, seconds) = progress
+            .history
+            .iter()
+            .fold((0, 0.0), |(images, seconds), epoch| (images + epoch.images, seconds + epoch.train_seconds));
         let result = TrainResult {
             model: self.folder.model(),
             epochs: last.epoch,

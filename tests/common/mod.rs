@@ -1,3 +1,6 @@
-//! What several tests share.
+//! What several tests share. Not every test uses all of it.
+#![allow(dead_code)]
 
+pub mod command;
 pub mod formula;
+pub mod painted_log;

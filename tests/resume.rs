@@ -1,0 +1,112 @@
+//! A run that is killed in the middle of an epoch, or interrupted, goes on to the same bits as one that was left alone.
+
+mod common;
+
+use std::fs;
+use std::io::Read;
+use std::path::Path;
+use std::process::{Child, Stdio};
+use std::thread::sleep;
+use std::time::{Duration, Instant};
+
+use common::command::{json, steersman};
+use common::painted_log;
+
+/// Small batches, so that an epoch takes long enough to be interrupted; a schedule and early stopping, so that their memory
+/// has to survive too.
+const ARGS: [&str; 17] = [
+    "train",
+    "log",
+    "--recipe",
+    "lenet",
+    "--set",
+    "epochs=4",
+    "--set",
+    "batch=4",
+    "--set",
+    "schedule.shape={kind='reduce_on_plateau', factor=0.5, patience_epochs=1}",
+    "--set",
+    "early_stopping={patience_epochs=9}",
+    "--set",
+    "samples.flip=both",
+    "--json",
+    "--seed",
+    "5",
+];
+
+fn uninterrupted(folder: &Path) -> serde_json::Value {
+    json(folder, &[&ARGS[..], &["--out", "whole"]].concat())
+}
+
+fn start(folder: &Path, out: &str) -> Child {
+    steersman(folder).args(ARGS).args(["--out", out]).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap()
+}
+
+/// Waits until the first epoch is on disk, then until the second is under way.
+fn wait_for_second_epoch(folder: &Path, out: &str) {
+    let deadline = Instant::now() + Duration::from_secs(120);
+    while !folder.join(out).join("checkpoint.safetensors").exists() {
+        assert!(Instant::now() < deadline, "no checkpoint");
+        sleep(Duration::from_millis(5));
+    }
+    sleep(Duration::from_millis(50));
+}
+
+fn assert_same_result(folder: &Path, out: &str, whole: &serde_json::Value) {
+    for key in ["weights_hash", "val_mse", "val_center_mse", "train_mse", "best_epoch", "epochs"] {
+        let resumed = json(folder, &["train", "--resume", out, "--json"]);
+        assert_eq!(resumed[key], whole[key], "{key}");
+    }
+    let model = |run: &str| fs::read(folder.join(run).join("last.safetensors")).unwrap();
+    assert!(model(out) == model("whole"), "the model files differ");
+    let left =
+        fs::read_dir(folder.join(out)).unwrap().filter(|e| e.as_ref().unwrap().file_name() != "run.json").count();
+    let expected = fs::read_dir(folder.join("whole")).unwrap().count() - 1;
+    assert_eq!(left, expected, "temporary files are left behind");
+}
+
+#[test]
+fn a_killed_run_goes_on_to_the_same_bits() {
+    let folder = tempfile::tempdir().unwrap();
+    painted_log::write(&folder.path().join("log"), 400, "");
+    let whole = uninterrupted(folder.path());
+    let mut child = start(folder.path(), "killed");
+    wait_for_second_epoch(folder.path(), "killed");
+    child.kill().unwrap();
+    child.wait().unwrap();
+    assert!(!folder.path().join("killed/result.json").exists(), "it was finished before it could be killed");
+    assert_same_result(folder.path(), "killed", &whole);
+}
+
+#[cfg(unix)]
+#[test]
+fn ctrl_c_saves_in_the_middle_of_an_epoch_and_the_run_goes_on_to_the_same_bits() {
+    let folder = tempfile::tempdir().unwrap();
+    painted_log::write(&folder.path().join("log"), 400, "");
+    let whole = uninterrupted(folder.path());
+    let mut child = start(folder.path(), "stopped");
+    wait_for_second_epoch(folder.path(), "stopped");
+    let interrupt = std::process::Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
+    assert!(interrupt.success());
+    let status = child.wait().unwrap();
+    let mut message = String::new();
+    child.stderr.take().unwrap().read_to_string(&mut message).unwrap();
+    assert_eq!(status.code(), Some(130), "{message}");
+    assert!(message.contains("go on with: steersman train --resume stopped"), "{message}");
+    assert_same_result(folder.path(), "stopped", &whole);
+}
+
+#[test]
+fn a_run_whose_recording_has_changed_does_not_go_on() {
+    let folder = tempfile::tempdir().unwrap();
+    let log = painted_log::write(&folder.path().join("log"), 200, "");
+    let mut child = start(folder.path(), "run");
+    wait_for_second_epoch(folder.path(), "run");
+    child.kill().unwrap();
+    child.wait().unwrap();
+    fs::remove_file(folder.path().join("run/result.json")).unwrap_or_default();
+    let text = fs::read_to_string(&log).unwrap();
+    fs::write(&log, text.lines().take(150).collect::<Vec<_>>().join("\n")).unwrap();
+    let message = common::command::error(folder.path(), &["train", "--resume", "run"]);
+    assert!(message.contains("the recordings have changed since the run began"), "{message}");
+}
