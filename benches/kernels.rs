@@ -8,7 +8,7 @@ use std::hint::black_box;
 use steersman_kernels::conv::{Conv, ConvShape};
 use steersman_kernels::gemm::{gemm, gemm_scratch_len};
 use steersman_kernels::pool::PoolShape;
-use steersman_kernels::{Isa, activation, norm, peak, pool, update};
+use steersman_kernels::{Isa, activation, baseline, norm, peak, pool, update};
 
 /// Images in a call: one shard of a training batch.
 const IMAGES: usize = 8;
@@ -47,6 +47,9 @@ fn convolutions(criterion: &mut Criterion) {
         group.throughput(Throughput::Elements(2 * IMAGES as u64 * shape.multiply_adds()));
         group.bench_function("forward", |b| {
             b.iter(|| conv.forward(IMAGES, black_box(&x), &weight, &bias, &mut y, &mut scratch));
+        });
+        group.bench_function("forward by im2col and matrixmultiply", |b| {
+            b.iter(|| baseline::conv_forward(&shape, IMAGES, black_box(&x), &weight, &bias, &mut y));
         });
         group.bench_function("backward_input", |b| {
             b.iter(|| conv.backward_input(IMAGES, black_box(&dy), &weight, &mut dx, &mut scratch));

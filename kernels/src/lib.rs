@@ -23,6 +23,7 @@
 #[macro_use]
 pub mod isa;
 pub mod activation;
+pub mod baseline;
 pub mod conv;
 pub mod gemm;
 pub mod im2col;

@@ -175,7 +175,7 @@ impl Network {
         let mut text = String::new();
         // Writing to a String cannot fail.
         let _ = writeln!(text, "{:<10} {:<24} {:<14} {:>10} {:>14}", "layer", "kind", "output", "params", "mult-adds");
-        let _ = writeln!(text, "{rule}\n{:<10} {:<24} {:<14}", "input", "", self.input.to_string());
+        let _ = writeln!(text, "{rule}\n{:<35} {}", "input", self.input);
         for NamedLayer { name, spec, layer, params, statistics } in &self.layers {
             let count = group_digits((params.len() + statistics.len()) as u64);
             let multiply_adds = match layer.multiply_adds() {
@@ -183,7 +183,8 @@ impl Network {
                 number => group_digits(number),
             };
             let output = layer.output().to_string();
-            let _ = writeln!(text, "{name:<10} {:<24} {output:<14} {count:>10} {multiply_adds:>14}", spec.describe());
+            let line = format!("{name:<10} {:<24} {output:<14} {count:>10} {multiply_adds:>14}", spec.describe());
+            let _ = writeln!(text, "{}", line.trim_end());
         }
         let (trainable, fixed) = (self.count(true) as u64, self.count(false) as u64);
         let _ = writeln!(text, "{rule}\nTotal params: {}", group_digits(trainable + fixed));

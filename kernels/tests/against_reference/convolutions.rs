@@ -4,7 +4,7 @@ use super::{Failures, isas, nans, numbers};
 use steersman_kernels::conv::{Conv, ConvShape};
 use steersman_kernels::gemm::{gemm, gemm_scratch_len};
 use steersman_kernels::im2col::{col2im, im2col};
-use steersman_kernels::reference;
+use steersman_kernels::{baseline, reference};
 
 /// Sizes c, h, w, oc; kernel; stride; padding top, bottom, left, right.
 type Case = ([usize; 4], [usize; 2], [usize; 2], [usize; 4]);
@@ -65,6 +65,12 @@ fn convolutions_agree_with_the_loops() {
             reference::conv_forward(&shape, n, &x, &weight, &bias, &mut y);
             reference::conv_backward_input(&shape, n, &dy, &weight, &mut dx);
             reference::conv_backward_weight(&shape, n, &x, &dy, &mut dweight, &mut dbias);
+            let mut actual = nans(n * y_len);
+            baseline::conv_forward(&shape, n, &x, &weight, &bias, &mut actual);
+            failures.compare(&format!("baseline forward n={n} {shape:?}"), &actual, &y, 1e-5);
+            let mut actual = nans(n * x_len);
+            baseline::conv_backward_input(&shape, n, &dy, &weight, &mut actual);
+            failures.compare(&format!("baseline backward_input n={n} {shape:?}"), &actual, &dx, 1e-5);
             for isa in isas() {
                 let conv = Conv::new(shape, isa);
                 let what = format!("{} n={n} {shape:?}", isa.name());
