@@ -11,6 +11,7 @@ use crate::error::{Error, Result};
 use crate::model_file::Model;
 use crate::network::{InferencePlan, Network, Parameters};
 use crate::recipe::Recipe;
+use crate::simulator::{DriveState, Driver, HEIGHT, RgbFrame, WIDTH};
 
 /// A model with everything planned to predict one image after the other on the calling thread.
 ///
@@ -127,6 +128,13 @@ impl Pilot {
     }
 }
 
+impl Driver for Pilot {
+    fn steer(&mut self, frame: &RgbFrame, _: &DriveState) -> f32 {
+        // A frame always has the size it says, so this cannot fail; the simulator takes what is no number as straight ahead.
+        Pilot::steer(self, HEIGHT, WIDTH, &frame.pixels).unwrap_or(f32::NAN)
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -155,7 +163,11 @@ mod tests {
             let mut pilot = pilot(name);
             let first = pilot.steer(160, 320, &usual).unwrap();
             assert!(pilot.steer(120, 160, &small).unwrap().is_finite());
-            assert_eq!(pilot.steer(160, 320, &usual).unwrap(), first, "{name}: an image must not depend on earlier ones");
+            assert_eq!(
+                pilot.steer(160, 320, &usual).unwrap(),
+                first,
+                "{name}: an image must not depend on earlier ones"
+            );
         }
     }
 

@@ -1,13 +1,11 @@
 //! `steersman train`: the main job.
 
 use std::path::PathBuf;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 
 use clap::Args;
 
 use super::progress::Progress;
-use super::{RecipeArgs, or_dash, pool, print_json};
+use super::{RecipeArgs, or_dash, pool, print_json, stop_on_ctrl_c};
 use crate::error::{Error, Result};
 use crate::training::{self, RunFolder, TrainRequest, TrainResult};
 
@@ -71,19 +69,6 @@ pub fn run(args: TrainArgs) -> Result<()> {
         }
         Err(error) => Err(error),
     }
-}
-
-/// A flag that Ctrl-C sets; the second Ctrl-C ends the process at once.
-fn stop_on_ctrl_c() -> Result<Arc<AtomicBool>> {
-    let stop = Arc::new(AtomicBool::new(false));
-    let flag = stop.clone();
-    let handler = move || {
-        if flag.swap(true, Ordering::Relaxed) {
-            std::process::exit(130);
-        }
-    };
-    ctrlc::set_handler(handler).map_err(|e| Error::Usage(format!("cannot listen for Ctrl-C: {e}")))?;
-    Ok(stop)
 }
 
 fn report(result: &TrainResult, json: bool) -> Result<()> {
