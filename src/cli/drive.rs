@@ -5,10 +5,13 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use clap::Args;
 use serde::Serialize;
+use steersman_kernels::Isa;
 
 use super::share_bar::ShareBar;
 use super::{pool, print_json, stop_on_ctrl_c};
 use crate::error::{Error, Result};
+use crate::main_job::held_out::{held_out_tracks, trained_on_held_out};
+use crate::model_file::Model;
 use crate::pilot::Pilot;
 use crate::simulator::drive::write_trajectories;
 use crate::simulator::statistics::PairedTest;
@@ -134,7 +137,14 @@ impl Wheel {
         Ok(match name {
             "expert" => Wheel::Expert,
             "zero" => Wheel::Zero,
-            path => Wheel::Model(Box::new(Pilot::load(Path::new(path))?)),
+            path => {
+                let model = Model::load(Path::new(path))?;
+                let held_out = held_out_tracks(&model.record.recordings)?;
+                if !held_out.is_empty() {
+                    eprintln!("note: {path} was {}", trained_on_held_out(&held_out));
+                }
+                Wheel::Model(Box::new(Pilot::new(model, Isa::best())?))
+            }
         })
     }
 

@@ -71,8 +71,8 @@ pub fn main() -> ExitCode {
 /// Which recipe, and what to change in it.
 #[derive(Clone, Debug, Args)]
 struct RecipeArgs {
-    /// A built-in recipe (hyper, hyper-prelu, lenet, pilotnet) or a recipe file
-    #[arg(long, value_name = "NAME|FILE", default_value = "lenet")]
+    /// A built-in recipe (default, hyper, hyper-prelu, lenet, pilotnet) or a recipe file
+    #[arg(long, value_name = "NAME|FILE", default_value = "default")]
     recipe: String,
     /// Change an entry of the recipe, as in epochs=3 or optimizer.learning_rate=1e-4
     #[arg(long = "set", value_name = "KEY=VALUE")]
