@@ -11,7 +11,7 @@ use crate::error::{Error, Result};
 use crate::simulator::{RecordOptions, Track, builtin, record};
 
 /// Random tracks in the set. Variety of looks teaches more than laps: each is driven for a fraction of a lap.
-const RANDOM_TRACKS: u64 = 24;
+const RANDOM_TRACKS: u64 = 48;
 /// Seed of the first recording; far from those that drives begin with, so that starts and light are others.
 const FIRST_SEED: u64 = 101;
 
@@ -66,8 +66,8 @@ pub fn takes() -> Vec<Take> {
     for number in 1..=RANDOM_TRACKS {
         let track = format!("random:{number}");
         let odd = number % 2 == 1;
-        take(&track, 0.2, odd, false);
-        take(&track, 0.1, !odd, true);
+        take(&track, 0.08, odd, false);
+        take(&track, 0.06, !odd, true);
     }
     takes
 }
