@@ -69,6 +69,7 @@ pub mod cli;
 pub mod dataset;
 pub mod error;
 pub mod layers;
+pub mod main_job;
 pub mod model_file;
 pub mod network;
 pub mod optimizer;

@@ -11,6 +11,7 @@ use crate::error::{Error, Result};
 use crate::model_file::Model;
 use crate::network::{InferencePlan, Network, Parameters};
 use crate::recipe::Recipe;
+use crate::simulator::{DriveState, Driver, HEIGHT, RgbFrame, WIDTH};
 
 /// A model with everything planned to predict one image after the other on the calling thread.
 ///
@@ -124,6 +125,13 @@ impl Pilot {
             Error::Usage(message) => Error::data(path, message),
             other => other,
         })
+    }
+}
+
+impl Driver for Pilot {
+    fn steer(&mut self, frame: &RgbFrame, _: &DriveState) -> f32 {
+        // A frame always has the size it says, so this cannot fail; the simulator takes what is no number as straight ahead.
+        Pilot::steer(self, HEIGHT, WIDTH, &frame.pixels).unwrap_or(f32::NAN)
     }
 }
 

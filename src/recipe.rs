@@ -23,7 +23,8 @@ use crate::tensor::Shape;
 use crate::training::Loss;
 
 /// Name and text of each recipe that is built in.
-pub const SHIPPED: [(&str, &str); 4] = [
+pub const SHIPPED: [(&str, &str); 5] = [
+    ("default", include_str!("../data/recipes/default.toml")),
     ("hyper", include_str!("../data/recipes/hyper.toml")),
     ("hyper-prelu", include_str!("../data/recipes/hyper-prelu.toml")),
     ("lenet", include_str!("../data/recipes/lenet.toml")),
@@ -290,10 +291,10 @@ mod tests {
         assert!(error(&["split.mod=1"]).contains("did you mean `mode`?"));
         let recipe = Recipe::find("lente", &[]).unwrap_err().to_string();
         assert!(
-            recipe.starts_with("there is no recipe `lente` (did you mean `lenet`?); built in are hyper,"),
+            recipe.starts_with("there is no recipe `lente` (did you mean `lenet`?); built in are default,"),
             "{recipe}"
         );
-        let layers = SHIPPED[2].1.replacen("filters = 6", "filter = 6", 1);
+        let layers = SHIPPED[3].1.replacen("filters = 6", "filter = 6", 1);
         let layer = Recipe::parse("mine.toml", &layers, &[]).unwrap_err().to_string();
         assert_eq!(layer, "recipe mine.toml: layers, entry 2: unknown field `filter` (did you mean `filters`?)");
     }

@@ -4,14 +4,19 @@
 //! JSON value. Exit codes: 0 done, 1 error, 2 wrong arguments, 130 interrupted.
 
 mod bench;
+mod drive;
 mod evaluate;
 mod inspect;
 mod predict;
 mod progress;
+mod record;
+mod share_bar;
 mod summary;
 mod train;
 
 use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use clap::{Args, Parser, Subcommand};
@@ -31,6 +36,8 @@ struct Cli {
 #[derive(Debug, Subcommand)]
 enum Command {
     Train(train::TrainArgs),
+    Record(record::RecordArgs),
+    Drive(drive::DriveArgs),
     Evaluate(evaluate::EvaluateArgs),
     Predict(predict::PredictArgs),
     Inspect(inspect::InspectArgs),
@@ -43,6 +50,8 @@ pub fn main() -> ExitCode {
     let started = Instant::now();
     let result = match Cli::parse().command {
         Command::Train(args) => train::run(args),
+        Command::Record(args) => record::run(args),
+        Command::Drive(args) => drive::run(args),
         Command::Evaluate(args) => evaluate::run(args),
         Command::Predict(args) => predict::run(args),
         Command::Inspect(args) => inspect::run(args),
@@ -62,8 +71,8 @@ pub fn main() -> ExitCode {
 /// Which recipe, and what to change in it.
 #[derive(Clone, Debug, Args)]
 struct RecipeArgs {
-    /// A built-in recipe (hyper, hyper-prelu, lenet, pilotnet) or a recipe file
-    #[arg(long, value_name = "NAME|FILE", default_value = "lenet")]
+    /// A built-in recipe (default, hyper, hyper-prelu, lenet, pilotnet) or a recipe file
+    #[arg(long, value_name = "NAME|FILE", default_value = "default")]
     recipe: String,
     /// Change an entry of the recipe, as in epochs=3 or optimizer.learning_rate=1e-4
     #[arg(long = "set", value_name = "KEY=VALUE")]
@@ -80,6 +89,19 @@ impl RecipeArgs {
 fn pool(threads: usize) -> Result<rayon::ThreadPool> {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
     pool.map_err(|e| Error::Usage(format!("cannot start {threads} threads: {e}; give a smaller number with --threads")))
+}
+
+/// A flag that Ctrl-C sets; the second Ctrl-C ends the process at once.
+fn stop_on_ctrl_c() -> Result<Arc<AtomicBool>> {
+    let stop = Arc::new(AtomicBool::new(false));
+    let flag = stop.clone();
+    let handler = move || {
+        if flag.swap(true, Ordering::Relaxed) {
+            std::process::exit(130);
+        }
+    };
+    ctrlc::set_handler(handler).map_err(|e| Error::Usage(format!("cannot listen for Ctrl-C: {e}")))?;
+    Ok(stop)
 }
 
 /// Prints one JSON value as the last line.

@@ -130,7 +130,7 @@ where
     let pairs: Vec<(RunPair, Run, f64)> = (0..options.runs as u64)
         .into_par_iter()
         .map(|k| {
-            let seed = options.seed + k;
+            let seed = options.seed.wrapping_add(k);
             let free = run(track, new_driver()?.as_mut(), &of_run(false), seed)?;
             let mut simulated_s = free.time_s;
             // A run that nobody would have interrupted is the same with help as without.

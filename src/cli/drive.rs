@@ -1,0 +1,185 @@
+//! `steersman drive`: closed-loop driving in the simulator.
+
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use clap::Args;
+use serde::Serialize;
+use steersman_kernels::Isa;
+
+use super::share_bar::ShareBar;
+use super::{pool, print_json, stop_on_ctrl_c};
+use crate::error::{Error, Result};
+use crate::main_job::held_out::{held_out_tracks, trained_on_held_out};
+use crate::model_file::Model;
+use crate::pilot::Pilot;
+use crate::simulator::drive::write_trajectories;
+use crate::simulator::statistics::PairedTest;
+use crate::simulator::{DriveOptions, DriveResult, DriveSummary, Driver, Expert, Speed, Track, Zero, compare, drive};
+
+/// Let a model drive in the simulator and measure how well
+#[derive(Debug, Args)]
+pub struct DriveArgs {
+    /// Model file, or `expert`, or `zero` (never steers)
+    model: String,
+    /// lake, mountain, coast, forest, random:SEED, or a track file
+    #[arg(long)]
+    track: String,
+    /// Laps of each run
+    #[arg(long, default_value_t = 1)]
+    laps: usize,
+    /// Speed to hold in mph, or `auto`: 30 mph, less in bends
+    #[arg(long, default_value = "20", value_name = "MPH|auto", value_parser = speed)]
+    speed: Speed,
+    /// Runs, each with a seed of its own, counted from --seed
+    #[arg(long, default_value_t = 10)]
+    runs: usize,
+    /// First seed; a seed draws start, direction, light, texture and noise
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Time from a picture to the wheels, ms
+    #[arg(long, default_value_t = 0.0, value_name = "MS")]
+    latency_ms: f64,
+    /// Standard deviation of a disturbance of the steering
+    #[arg(long, default_value_t = 0.0)]
+    noise: f64,
+    /// A second model, `expert` or `zero`: drives the same seeds, and the difference is tested
+    #[arg(long, value_name = "MODEL")]
+    against: Option<String>,
+    /// Save the trajectories as csv files; the folder must not exist
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// Threads; 0 is one for each core
+    #[arg(long, default_value_t = 0)]
+    threads: usize,
+    /// Print one JSON object as the last line
+    #[arg(long)]
+    json: bool,
+}
+
+/// What `drive --json` prints.
+#[derive(Serialize)]
+struct Report<'a> {
+    #[serde(flatten)]
+    summary: &'a DriveSummary,
+    /// The same of the second model.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    against: Option<&'a DriveSummary>,
+    /// A is the first model, B the second.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    comparison: Vec<PairedTest>,
+}
+
+pub fn run(args: DriveArgs) -> Result<()> {
+    let track = Track::load(&args.track)?;
+    let options = DriveOptions {
+        laps: args.laps,
+        runs: args.runs,
+        seed: args.seed,
+        speed: args.speed,
+        latency_ms: args.latency_ms,
+        noise: args.noise,
+    };
+    let at_wheel = Wheel::find(&args.model)?;
+    let against = args.against.as_deref().map(Wheel::find).transpose()?;
+    if let Some(out) = args.out.as_deref().filter(|out| out.exists()) {
+        let message = format!("{}: exists already and is not overwritten; name a new folder", out.display());
+        return Err(Error::Usage(message));
+    }
+    let stop = stop_on_ctrl_c()?;
+    let pool = pool(args.threads)?;
+    let go = |wheel: &Wheel, name: &str| pool.install(|| wheel.drive(&track, &options, name, &stop));
+    let result = go(&at_wheel, &args.model)?;
+    let other = match (&against, &args.against) {
+        (Some(wheel), Some(name)) => Some(go(wheel, name)?),
+        _ => None,
+    };
+    let comparison = other.as_ref().map_or(Ok(Vec::new()), |other| compare(&result, other))?;
+    if let Some(out) = &args.out {
+        write_trajectories(&result, out)?;
+    }
+    if args.json {
+        let against = other.as_ref().map(|other| &other.summary);
+        return print_json(&Report { summary: &result.summary, against, comparison });
+    }
+    print_summary(&args.model, &result.summary);
+    if let (Some(other), Some(name)) = (&other, &args.against) {
+        println!();
+        print_summary(name, &other.summary);
+        println!("\nA is {}, B is {name}; p: how often chance alone differs as much", args.model);
+        for test in comparison {
+            let verdict = if test.significant() { "more than chance" } else { "may be chance" };
+            let PairedTest { measure, mean_a, mean_b, p_value } = &test;
+            println!("{measure:<45} A {mean_a:>8.3}  B {mean_b:>8.3}  p {p_value:.4}  {verdict}");
+        }
+    }
+    Ok(())
+}
+
+/// `20` or `auto`.
+fn speed(text: &str) -> Result<Speed, String> {
+    match text.parse() {
+        _ if text == "auto" => Ok(Speed::Auto),
+        Ok(mph) => Ok(Speed::Fixed(mph)),
+        Err(_) => Err("a number of mph or `auto` is meant".into()),
+    }
+}
+
+/// Who steers.
+enum Wheel {
+    Expert,
+    Zero,
+    Model(Box<Pilot>),
+}
+
+impl Wheel {
+    fn find(name: &str) -> Result<Wheel> {
+        Ok(match name {
+            "expert" => Wheel::Expert,
+            "zero" => Wheel::Zero,
+            path => {
+                let model = Model::load(Path::new(path))?;
+                let held_out = held_out_tracks(&model.record.recordings)?;
+                if !held_out.is_empty() {
+                    eprintln!("note: {path} was {}", trained_on_held_out(&held_out));
+                }
+                Wheel::Model(Box::new(Pilot::new(model, Isa::best())?))
+            }
+        })
+    }
+
+    fn drive(&self, track: &Track, options: &DriveOptions, name: &str, stop: &AtomicBool) -> Result<DriveResult> {
+        let new_driver = || -> Result<Box<dyn Driver>> {
+            Ok(match self {
+                Wheel::Expert => Box::new(Expert),
+                Wheel::Zero => Box::new(Zero),
+                Wheel::Model(pilot) => pilot.clone(),
+            })
+        };
+        let bar = ShareBar::new(format!("{name} on {}", track.name()));
+        let progress = |share| {
+            bar.set(share);
+            !stop.load(Ordering::Relaxed)
+        };
+        drive(track, new_driver, options, &progress)
+    }
+}
+
+fn print_summary(model: &str, s: &DriveSummary) {
+    let held_out = if s.held_out { " (held out)" } else { "" };
+    println!("{model} on {}{held_out}, {} runs", s.track, s.runs);
+    let (low, high) = (100.0 * s.completed_low, 100.0 * s.completed_high);
+    println!(
+        "laps completed             {}/{} (whole runs: {low:.0} to {high:.0} %, 95 %)",
+        s.laps_completed, s.laps_total
+    );
+    println!("autonomy                   {:.1} %", s.autonomy_percent);
+    println!("interventions              {} ({:.2} a km)", s.interventions, s.interventions_per_km);
+    println!("distance driven            {:.0} m", s.distance_m);
+    println!("cross-track mean/RMS/p95   {:.2} / {:.2} / {:.2} m", s.cte_mean_m, s.cte_rms_m, s.cte_p95_m);
+    println!("off the road               {:.1} s", s.off_road_s);
+    println!("crashes                    {}", s.crashes);
+    println!("mean speed                 {:.1} mph", s.mean_speed_mph);
+    println!("whiteness                  {:.1} deg/s (expert {:.1})", s.whiteness_deg_s, s.expert_whiteness_deg_s);
+    println!("real-time factor           {:.1}", s.realtime_factor);
+}

@@ -1,0 +1,103 @@
+//! `steersman record`: the expert drives, the cameras watch.
+
+use std::path::PathBuf;
+use std::sync::atomic::Ordering;
+
+use clap::{Args, ValueEnum};
+
+use super::share_bar::ShareBar;
+use super::{pool, print_json, stop_on_ctrl_c};
+use crate::error::Result;
+use crate::simulator::expert::Style;
+use crate::simulator::{LogFormat, RecordOptions, Track, record};
+
+/// Record the expert driver in the simulator, in the format of Udacity's simulator
+#[derive(Debug, Args)]
+pub struct RecordArgs {
+    /// lake, mountain, coast, forest, random:SEED, or a track file
+    #[arg(long)]
+    track: String,
+    /// Laps to drive; with --recovery laps along which the car is put off its line
+    #[arg(long, default_value_t = 1.0)]
+    laps: f64,
+    /// Drive the other way round
+    #[arg(long)]
+    reverse: bool,
+    /// Put the car off its line again and again, and record only the ways back
+    #[arg(long)]
+    recovery: bool,
+    /// How the expert moves the wheel
+    #[arg(long, value_enum, default_value_t = WheelStyle::Smooth)]
+    style: WheelStyle,
+    /// Draws where the drive begins, its light and its texture
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Speed to hold, mph
+    #[arg(long, default_value_t = 20.0, value_name = "MPH")]
+    speed: f64,
+    /// Standard deviation of a disturbance of the steering that the labels do not show
+    #[arg(long, default_value_t = 0.0)]
+    noise: f64,
+    /// How the log is written
+    #[arg(long, value_enum, default_value_t = Format::Sample)]
+    format: Format,
+    /// Folder of the recording; must not exist
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// Threads; 0 is one for each core
+    #[arg(long, default_value_t = 0)]
+    threads: usize,
+    /// Print one JSON object as the last line
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum WheelStyle {
+    /// Small steady movements
+    Smooth,
+    /// Through two keys: labels are often zero, with spikes between
+    Keyboard,
+}
+
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum Format {
+    /// As Udacity's sample data: with header, paths relative to the log
+    Sample,
+    /// As version 2 of Udacity's simulator: without header, absolute paths
+    V2,
+}
+
+pub fn run(args: RecordArgs) -> Result<()> {
+    let track = Track::load(&args.track)?;
+    let options = RecordOptions {
+        laps: args.laps,
+        reverse: args.reverse,
+        recovery: args.recovery,
+        style: match args.style {
+            WheelStyle::Smooth => Style::Smooth,
+            WheelStyle::Keyboard => Style::Keyboard,
+        },
+        seed: args.seed,
+        speed_mph: args.speed,
+        noise: args.noise,
+        format: match args.format {
+            Format::Sample => LogFormat::Sample,
+            Format::V2 => LogFormat::V2,
+        },
+    };
+    let stop = stop_on_ctrl_c()?;
+    let bar = ShareBar::new(format!("recording {}", track.name()));
+    let progress = |share| {
+        bar.set(share);
+        !stop.load(Ordering::Relaxed)
+    };
+    let info = pool(args.threads)?.install(|| record(&track, &options, &args.out, &progress))?;
+    drop(bar);
+    if args.json {
+        return print_json(&info);
+    }
+    let held_out = if info.held_out { ", a track that training must not see" } else { "" };
+    println!("{} rows of {}{held_out} in {}", info.rows, info.track, args.out.display());
+    Ok(())
+}

@@ -1,0 +1,195 @@
+//! What the main job trains on: drives of the expert on training tracks, recorded once and used again.
+
+use std::path::{Path, PathBuf};
+use std::sync::Mutex;
+
+use rayon::prelude::*;
+use serde::Serialize;
+use sha2::{Digest, Sha256};
+
+use crate::error::{Error, Result};
+use crate::simulator::{RecordOptions, Track, builtin, record};
+
+/// Random tracks in the set. Variety of looks teaches more than laps: each is driven for a fraction of a lap.
+const RANDOM_TRACKS: u64 = 48;
+/// Seed of the first recording; far from those that drives begin with, so that starts and light are others.
+const FIRST_SEED: u64 = 101;
+
+/// One recording of the set.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Take {
+    /// Track as on the command line.
+    pub track: String,
+    /// See [`RecordOptions::laps`].
+    pub laps: f64,
+    /// Driven the other way round.
+    pub reverse: bool,
+    /// Only ways back to the line.
+    pub recovery: bool,
+    /// Draws start, light and texture.
+    pub seed: u64,
+}
+
+impl Take {
+    /// Name of the recording's folder.
+    fn folder(&self) -> String {
+        let direction = if self.reverse { "-reverse" } else { "" };
+        let kind = if self.recovery { "-recovery" } else { "" };
+        format!("{}{direction}{kind}", self.track.replace(':', "-"))
+    }
+
+    fn options(&self) -> RecordOptions {
+        RecordOptions {
+            laps: self.laps,
+            reverse: self.reverse,
+            recovery: self.recovery,
+            seed: self.seed,
+            ..Default::default()
+        }
+    }
+}
+
+/// The takes of the set, grouped by track: the training tracks in both directions, plain and recovery; then random tracks
+/// in one direction plain and in the other with recovery, or the other way about.
+pub fn takes() -> Vec<Take> {
+    let mut takes = Vec::new();
+    let mut take = |track: &str, laps, reverse, recovery| {
+        let seed = FIRST_SEED + takes.len() as u64;
+        takes.push(Take { track: track.into(), laps, reverse, recovery, seed });
+    };
+    for track in ["lake", "mountain"] {
+        for (laps, recovery) in [(0.5, false), (0.25, true)] {
+            take(track, laps, false, recovery);
+            take(track, laps, true, recovery);
+        }
+    }
+    for number in 1..=RANDOM_TRACKS {
+        let track = format!("random:{number}");
+        let odd = number % 2 == 1;
+        take(&track, 0.08, odd, false);
+        take(&track, 0.06, !odd, true);
+    }
+    takes
+}
+
+/// What a set is made from, as text: a set with the same text has the same pictures.
+fn settings(takes: &[Take]) -> Result<String> {
+    #[derive(Serialize)]
+    struct Settings<'a> {
+        version: &'a str,
+        tracks_hash: String,
+        take: &'a [Take],
+    }
+    let mut tracks = Sha256::new();
+    builtin::names().filter_map(builtin::text).for_each(|text| tracks.update(text));
+    let settings = Settings { version: env!("CARGO_PKG_VERSION"), tracks_hash: digits(tracks), take: takes };
+    toml::to_string(&settings).map_err(|e| Error::Usage(format!("the training set cannot be described: {e}")))
+}
+
+/// The first 16 digits of a hash.
+fn digits(hash: Sha256) -> String {
+    hash.finalize().iter().take(8).map(|byte| format!("{byte:02x}")).collect()
+}
+
+/// The recordings of `takes` under `folder`, in order; recorded first if they are not there yet. The flag tells whether
+/// they were.
+///
+/// A set lies in a folder named after a hash of its settings. It is written under another name and renamed when it is
+/// complete, so a set that is there is whole. `progress` is told the share that is recorded and may return `false` to stop.
+///
+/// # Errors
+///
+/// [`Error::Io`] if something cannot be written, [`Error::Data`] if recordings were taken out of a set,
+/// [`Error::Interrupted`] if `progress` stopped it; nothing is left behind then.
+pub fn recordings(
+    folder: &Path,
+    takes: &[Take],
+    progress: &(dyn Fn(f64) -> bool + Sync),
+) -> Result<(Vec<PathBuf>, bool)> {
+    let settings = settings(takes)?;
+    let set = folder.join(format!("set-{}", digits(Sha256::new_with_prefix(&settings))));
+    let paths: Vec<PathBuf> = takes.iter().map(|take| set.join(take.folder())).collect();
+    if set.exists() {
+        if let Some(gone) = paths.iter().find(|path| !path.join("recording.toml").is_file()) {
+            let message = "this recording of the training set is gone or not whole; remove the folder of the set, it will \
+                           be recorded again";
+            return Err(Error::data(gone, message));
+        }
+        return Ok((paths, true));
+    }
+    std::fs::create_dir_all(folder).map_err(Error::io(folder))?;
+    let unfinished = tempfile::Builder::new().prefix("unfinished-").tempdir_in(folder).map_err(Error::io(folder))?;
+    let shares = Mutex::new(vec![0.0; takes.len()]);
+    let in_all: f64 = takes.iter().map(|take| take.laps).sum();
+    let numbered: Vec<(usize, &Take)> = takes.iter().enumerate().collect();
+    let of_tracks: Vec<_> = numbered.chunk_by(|(_, a), (_, b)| a.track == b.track).collect();
+    of_tracks.into_par_iter().try_for_each(|group| {
+        let track = Track::load(&group[0].1.track)?;
+        if track.held_out() {
+            return Err(Error::Usage(format!("{} is held out; the training set must not have it", track.name())));
+        }
+        group.iter().try_for_each(|&(number, take)| {
+            let of_take = |share| {
+                let mut shares = shares.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
+                shares[number] = f64::max(shares[number], share * take.laps);
+                progress(shares.iter().sum::<f64>() / in_all)
+            };
+            record(&track, &take.options(), &unfinished.path().join(take.folder()), &of_take).map(drop)
+        })
+    })?;
+    let side = unfinished.path().join("set.toml");
+    std::fs::write(&side, settings).map_err(Error::io(&side))?;
+    let unfinished = unfinished.keep();
+    std::fs::rename(&unfinished, &set).map_err(Error::io(&set))?;
+    Ok((paths, false))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn few() -> Vec<Take> {
+        let take =
+            |track: &str, recovery, seed| Take { track: track.into(), laps: 0.01, reverse: true, recovery, seed };
+        vec![take("lake", false, 1), take("lake", true, 2), take("random:4", false, 3)]
+    }
+
+    #[test]
+    fn the_set_has_both_training_tracks_in_both_directions_with_recovery_and_no_held_out_track() {
+        let takes = takes();
+        for track in ["lake", "mountain"] {
+            for (reverse, recovery) in [(false, false), (false, true), (true, false), (true, true)] {
+                let wanted = |t: &&Take| t.track == track && t.reverse == reverse && t.recovery == recovery;
+                assert_eq!(takes.iter().filter(wanted).count(), 1, "{track} {reverse} {recovery}");
+            }
+        }
+        assert!(takes.iter().all(|take| !Track::load(&take.track).unwrap().held_out()));
+        let mut folders: Vec<String> = takes.iter().map(Take::folder).collect();
+        folders.sort();
+        folders.dedup();
+        assert_eq!(folders.len(), takes.len());
+    }
+
+    #[test]
+    fn a_set_is_recorded_once_and_one_that_lacks_something_is_an_error() {
+        let folder = tempfile::tempdir().unwrap();
+        let (paths, reused) = recordings(folder.path(), &few(), &|_| true).unwrap();
+        assert!(!reused && paths.len() == 3 && paths.iter().all(|path| path.join("driving_log.csv").is_file()));
+        let again = recordings(folder.path(), &few(), &|_| panic!("nothing is to be recorded")).unwrap();
+        assert_eq!(again, (paths.clone(), true));
+        let other: Vec<Take> = few().into_iter().map(|take| Take { seed: take.seed + 10, ..take }).collect();
+        assert!(recordings(folder.path(), &other, &|_| true).unwrap().0[0] != paths[0]);
+        std::fs::remove_file(paths[1].join("recording.toml")).unwrap();
+        let error = recordings(folder.path(), &few(), &|_| true).unwrap_err().to_string();
+        assert!(error.contains("recorded again"), "{error}");
+    }
+
+    #[test]
+    fn what_is_stopped_or_refused_leaves_nothing_behind() {
+        let folder = tempfile::tempdir().unwrap();
+        assert!(matches!(recordings(folder.path(), &few(), &|_| false), Err(Error::Interrupted)));
+        let held_out = vec![Take { track: "coast".into(), ..few()[0].clone() }];
+        assert!(recordings(folder.path(), &held_out, &|_| true).unwrap_err().to_string().contains("held out"));
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
+    }
+}
