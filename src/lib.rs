@@ -10,7 +10,7 @@
 //! and [`simulator`] how well it drives. [`cli`] is the command line.
 //!
 //! Dependencies point one way: `steersman-kernels` (all vector code and every `unsafe` line) ← [`tensor`] ← [`layers`] ←
-//! [`network`] ← [`optimizer`] ← [`training`]; [`dataset`] and [`simulator`] know no network.
+//! [`network`] (with the [`loss`]) ← [`optimizer`] ← [`training`]; [`dataset`] and [`simulator`] know no network.
 //!
 //! # Three promises
 //!
@@ -38,7 +38,7 @@
 //! use steersman::network::{LayerSpec, Network, StepInput, TrainingPlan};
 //! use steersman::optimizer::{Optimizer, OptimizerSpec};
 //! use steersman::tensor::{Initializer, Shape};
-//! use steersman::training::Loss;
+//! use steersman::loss::Loss;
 //! use steersman_kernels::Isa;
 //!
 //! // y = x1 − x2, learned by one dense layer.
@@ -52,7 +52,7 @@
 //! let mut optimizer = Optimizer::new(spec, None, &network);
 //! for step in 0..200 {
 //!     let input = StepInput { x: &x, labels: &labels, seed: 1, step };
-//!     plan.step(&network, &mut parameters, &Loss::MeanSquaredError, input);
+//!     plan.step(&network, &mut parameters, &Loss::default(), input);
 //!     let norm = plan.gradient_norm();
 //!     optimizer.step(0.3, &mut parameters.values, plan.gradient_mut(), norm);
 //! }
@@ -69,6 +69,7 @@ pub mod cli;
 pub mod dataset;
 pub mod error;
 pub mod layers;
+pub mod loss;
 pub mod main_job;
 pub mod model_file;
 pub mod network;

@@ -111,7 +111,7 @@ impl Model {
         }
         let metadata: Metadata = parse_metadata(path, &metadata)?;
         // Parsing the recipe's text again applies every check that a recipe file has to pass.
-        let recipe = Recipe::parse(&path.display().to_string(), &metadata.recipe.to_toml(), &[])?;
+        let recipe = Recipe::parse(&path.display().to_string(), &metadata.recipe.to_toml()?, &[])?;
         let network = recipe.network(Isa::PORTABLE)?;
         let parameters = read_parameters(path, &network, &tensors, "")?;
         let rows = find(path, &tensors, TRAINING_ROWS, Dtype::U64)?;
@@ -228,11 +228,11 @@ pub(crate) fn read_parameters(
     tensors: &SafeTensors,
     prefix: &str,
 ) -> Result<Parameters> {
-    let mut parameters =
-        Parameters { values: vec![0.0; network.count(true)], statistics: vec![0.0; network.count(false)] };
+    // Grown tensor by tensor, so that a recipe cannot ask for more memory than the file has numbers.
+    let mut parameters = Parameters { values: Vec::new(), statistics: Vec::new() };
     for tensor in network.tensors() {
         let values = find_f32(path, tensors, &format!("{prefix}{}", tensor.name), &tensor.spec.shape)?;
-        parameters.tensor_mut(tensor).copy_from_slice(&values);
+        if tensor.trainable { parameters.values.extend(values) } else { parameters.statistics.extend(values) }
     }
     Ok(parameters)
 }

@@ -17,10 +17,10 @@ use crate::dataset::preprocess::Preprocessing;
 use crate::dataset::split::SplitSpec;
 use crate::dataset::{Balance, SampleSpec};
 use crate::error::{Error, Result};
+use crate::loss::Loss;
 use crate::network::{LayerSpec, Network};
-use crate::optimizer::{OptimizerSpec, ScheduleSpec};
+use crate::optimizer::{OptimizerSpec, Schedule, ScheduleSpec};
 use crate::tensor::Shape;
-use crate::training::Loss;
 
 /// Name and text of each recipe that is built in.
 pub const SHIPPED: [(&str, &str); 5] = [
@@ -145,8 +145,12 @@ impl Recipe {
     }
 
     /// The text of a recipe file with every entry resolved.
-    pub fn to_toml(&self) -> String {
-        toml::to_string(self).expect("a recipe consists of strings, numbers, arrays and tables")
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Recipe`] if a number is larger than TOML can hold.
+    pub fn to_toml(&self) -> Result<String> {
+        toml::to_string(self).map_err(|e| Error::Recipe { recipe: self.name.clone(), message: e.to_string() })
     }
 
     /// The network of the recipe.
@@ -157,6 +161,10 @@ impl Recipe {
     pub fn network(&self, isa: Isa) -> Result<Network> {
         let [c, h, w] = self.preprocessing.output();
         let network = Network::new(Shape::new(c, h, w), &self.layers, isa)?;
+        if network.layers().iter().all(|l| l.layer.is_view()) {
+            let message = "a network needs a layer that computes something".into();
+            return Err(Error::Network { layer: "(all)".into(), message });
+        }
         if network.output() != Shape::vector(1) {
             let layer = network.layers().last().map_or(String::new(), |l| l.name.clone());
             let message =
@@ -167,8 +175,23 @@ impl Recipe {
     }
 
     fn check(&self) -> Result<(), String> {
+        let allowed = |c: char| c.is_alphanumeric() || "-_.".contains(c);
+        if self.name.is_empty() || self.name.starts_with('.') || !self.name.chars().all(allowed) {
+            return Err(format!("name must consist of letters, digits, - and _, not be `{}`", self.name));
+        }
         if self.epochs == 0 || self.batch == 0 {
             return Err("epochs and batch must be at least 1".into());
+        }
+        if let Some(EarlyStopping { min_delta, .. }) = self.early_stopping
+            && !(min_delta.is_finite() && min_delta >= 0.0)
+        {
+            return Err(format!("early_stopping.min_delta must not be negative or infinite, but is {min_delta}"));
+        }
+        let plateau = matches!(self.schedule.shape, Schedule::ReduceOnPlateau { .. });
+        if self.split.validation_share == 0.0 && (plateau || self.early_stopping.is_some()) {
+            return Err(
+                "early_stopping and reduce_on_plateau need a validation side: split.validation_share is 0".into()
+            );
         }
         if !(self.full_lock_deg.is_finite() && self.full_lock_deg > 0.0) {
             return Err(format!("full_lock_deg must be a positive number, not {}", self.full_lock_deg));
@@ -267,7 +290,7 @@ mod tests {
         for (name, _) in SHIPPED {
             let recipe = Recipe::find(name, &[]).unwrap();
             assert_eq!(recipe.name, name);
-            assert_eq!(Recipe::parse(name, &recipe.to_toml(), &[]).unwrap(), recipe);
+            assert_eq!(Recipe::parse(name, &recipe.to_toml().unwrap(), &[]).unwrap(), recipe);
         }
     }
 
@@ -289,6 +312,8 @@ mod tests {
         assert_eq!(error(&["epoch=3"]), "recipe lenet: unknown field `epoch` (did you mean `epochs`?)");
         assert!(error(&["optimizer.learningrate=1"]).ends_with("`learningrate` (did you mean `learning_rate`?)"));
         assert!(error(&["split.mod=1"]).contains("did you mean `mode`?"));
+        assert!(error(&["loss={kind='mean_squared_error', delta=1}"]).contains("unknown field `delta`"));
+        assert!(error(&["schedule.shape={kind='constant', factor=1}"]).contains("unknown field `factor`"));
         let recipe = Recipe::find("lente", &[]).unwrap_err().to_string();
         assert!(
             recipe.starts_with("there is no recipe `lente` (did you mean `lenet`?); built in are default,"),
@@ -307,5 +332,9 @@ mod tests {
         assert!(error(&["optimizer.learning_rate=-1"]).contains("learning_rate must be a positive number"));
         assert!(error(&["preprocessing.rows=[10, 200]"]).contains("rows"));
         assert!(error(&["preprocessing.resize=[4, 4]"]).contains("layer `pool1`"));
+        assert!(error(&["name='../x'"]).contains("letters, digits"));
+        assert!(error(&["early_stopping={patience_epochs=1}", "split.validation_share=0"]).contains("validation side"));
+        assert!(error(&["layers=[{kind='dense', units=100000000000000}]"]).contains("units"));
+        assert!(error(&["layers=[{kind='conv2d', filters=60000, kernel=[3, 3]}]"]).contains("more than"));
     }
 }

@@ -138,7 +138,7 @@ fn a_bad_row_is_counted_and_left_out_and_a_damaged_image_too() {
 fn inspect_prints_text_and_json() {
     let folder = folder_with_log(30);
     let text = String::from_utf8(run(folder.path(), &["inspect", "log"]).stdout).unwrap();
-    assert!(text.contains("30"), "{text}");
+    assert!(text.contains("30 of 30 usable"), "{text}");
     let reports = json(folder.path(), &["inspect", "log", "--json"]);
     assert_eq!(number(&reports[0], "usable"), 30.0);
 }

@@ -7,10 +7,10 @@ use common::formula::{hash, unit};
 use serde::Deserialize;
 use steersman::layers::gradcheck::relative_error;
 use steersman::layers::{Grads, Pair, Pass};
+use steersman::loss::Loss;
 use steersman::network::{LayerSpec, Network, Parameters, StepInput, TrainingPlan};
 use steersman::optimizer::{Optimizer, OptimizerSpec};
 use steersman::recipe::Recipe;
-use steersman::training::Loss;
 use steersman_kernels::Isa;
 
 const FORWARD: f64 = 1e-4;
@@ -149,7 +149,7 @@ impl LayerByLayer {
         }
         let mut gradient = vec![0.0; parameters.values.len()];
         let mut dy = vec![f32::NAN; n];
-        Loss::MeanSquaredError.value_and_gradient(outputs.last().unwrap(), labels, 1.0 / n as f32, &mut dy);
+        Loss::MeanSquaredError {}.value_and_gradient(outputs.last().unwrap(), labels, 1.0 / n as f32, &mut dy);
         for (index, named) in network.layers().iter().enumerate().rev() {
             let layer = &named.layer;
             let x = if index > 0 { &outputs[index - 1] } else { x };
@@ -213,7 +213,7 @@ fn check(name: &str, isa: Isa) {
     let mut losses = Vec::new();
     for step in 0..=golden.steps {
         let input = StepInput { x: &x, labels: &labels, seed: 0, step: step as u64 };
-        losses.push(plan.step(&network, &mut parameters, &Loss::MeanSquaredError, input));
+        losses.push(plan.step(&network, &mut parameters, &Loss::MeanSquaredError {}, input));
         if step == 0 {
             for tensor in network.tensors().iter().filter(|t| t.trainable) {
                 for gradient in [plan.gradient(), &plain.gradient] {

@@ -31,7 +31,7 @@ fn road([h, w]: [usize; 2]) -> Vec<u8> {
     let noise = hash("road");
     let pixel = |y: usize, x: usize, c: usize| {
         let gradient = [x * 255 / (w - 1), y * 255 / (h - 1), (x + y) * 255 / (w + h - 2)][c] as i64;
-        let edge = if (x / 16 + y / 16) % 2 == 0 { -40 } else { 40 };
+        let edge = if (x / 16 + y / 16).is_multiple_of(2) { -40 } else { 40 };
         let grain = i64::from(noise((y * w + x) * 3 + c) >> 24) % 65 - 32;
         (gradient + edge + grain).clamp(0, 255) as u8
     };

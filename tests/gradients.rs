@@ -4,11 +4,11 @@
 //! is measured against the norm of the tensor's gradient, which is what a random direction of signs sees of it on average.
 
 use rand::Rng;
+use steersman::loss::Loss;
 use steersman::network::{Network, Parameters, StepInput, Tensor, TrainingPlan};
 use steersman::random::{Purpose, rng, uniform, unit};
 use steersman::recipe::Recipe;
 use steersman::tensor::Shape;
-use steersman::training::Loss;
 use steersman_kernels::Isa;
 
 const IMAGES: usize = 6;
@@ -137,7 +137,7 @@ impl Check {
 }
 
 fn check(recipe: &str, size: &str) {
-    for loss in [Loss::MeanSquaredError, Loss::Huber { delta: 0.3 }] {
+    for loss in [Loss::MeanSquaredError {}, Loss::Huber { delta: 0.3 }] {
         let failures = Check::new(recipe, size, loss, Isa::best()).failures();
         assert!(failures.is_empty(), "{recipe}, {loss:?}: gradients off: {failures:?}");
     }

@@ -101,10 +101,10 @@ fn a_prediction_allocates_nothing() {
 fn training_gives_the_same_bits_for_any_number_of_threads_and_any_capacity() {
     let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
     for (recipe, size) in NETWORKS {
-        for images in [1, 3, 37] {
+        for images in [1, 3, 16, 29, 37] {
             let setup = Setup::new(recipe, size, images);
             let one = setup.train(1, images);
-            for (threads, capacity) in [(2, images), (5, images), (2, 64)] {
+            for (threads, capacity) in [(2, images), (5, images), (2, 40), (2, 64)] {
                 assert!(one == setup.train(threads, capacity), "{recipe}, {images} images, {threads} threads");
             }
         }

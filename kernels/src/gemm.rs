@@ -39,7 +39,7 @@ pub fn gemm_scratch_len(m: usize, k: usize, n: usize) -> usize {
 /// # Shapes
 /// `A` is `m x k`, `B` `k x n`, `C` `m x n`. Strides are those of a row and of a column, in elements: `(k, 1)` is a
 /// row-major `m x k` matrix and `(1, m)` the same read as transposed. With `beta = 0`, what `C` holds does not matter.
-/// Each element of `C` is summed in the order of `k`, in blocks of 256.
+/// The order in which an element of `C` is summed depends on the sizes, the strides and the instruction set alone.
 ///
 /// # Panics
 /// If a slice is shorter than its strides ask for, two elements of `C` share a place, or `scratch` has less than

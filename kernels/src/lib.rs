@@ -7,7 +7,7 @@
 //!
 //! # Dispatch
 //! Every kernel takes an [`Isa`], a token that only detection gives out. The body of a kernel is written once and
-//! compiled once for each instruction set. All kernels are single-threaded and allocate nothing; what they need to
+//! compiled once for each instruction set. All kernels are single-threaded and, but for [`baseline`], allocate nothing; what they need to
 //! work in is passed as `scratch`. The result depends on nothing but the arguments and the `Isa`: the same call gives
 //! the same bits. Two instruction sets may differ in rounding.
 //!

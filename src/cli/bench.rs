@@ -14,6 +14,9 @@ use crate::optimizer::Optimizer;
 use crate::random::{Purpose, rng, uniform};
 use crate::recipe::Recipe;
 
+/// Largest batch: beyond it, eight of them do not fit into memory.
+const MAX_BATCH: usize = 16_384;
+
 /// How many batches of random images are held in memory.
 const BATCHES: usize = 8;
 
@@ -57,8 +60,11 @@ struct BenchResult {
 }
 
 pub fn run(args: BenchArgs, started: Instant) -> Result<()> {
-    if args.batch == 0 || !(args.seconds > 0.0 && args.seconds < 1e6) {
-        return Err(Error::Usage("--batch and --seconds must be positive".into()));
+    let sensible = (1..=MAX_BATCH).contains(&args.batch) && args.seconds > 0.0 && args.seconds < 1e6;
+    if !sensible {
+        return Err(Error::Usage(format!(
+            "--batch must be 1 to {MAX_BATCH}, --seconds more than 0 and less than a million"
+        )));
     }
     let recipe = args.recipe.find()?;
     let pool = pool(args.threads)?;

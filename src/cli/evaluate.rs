@@ -36,20 +36,21 @@ pub fn run(args: EvaluateArgs) -> Result<()> {
     let full_lock_deg = model.recipe.full_lock_deg;
     let pilot = Pilot::new(model, Isa::best())?;
 
+    let pool = pool(args.threads)?;
     let mut predictions = Vec::new();
     let (mut known, mut sessions_before) = (0, 0);
     for path in &args.recordings {
-        let recording = dataset::load(path)?;
-        recording.require_usable()?;
-        for notice in &recording.notices {
-            eprintln!("{}: {notice}", path.display());
+        let recording = pool.install(|| dataset::load(path))?;
+        for notice in recording.notices_for(&pilot.recipe().preprocessing) {
+            eprintln!("{notice}");
         }
         known += (0..recording.rows.len()).filter(|row| trained_on.contains(&recording.row_id(*row))).count();
-        predictions.extend(pool(args.threads)?.install(|| predict(&pilot, &recording, sessions_before)));
+        predictions.extend(pool.install(|| predict(&pilot, &recording, sessions_before)));
         sessions_before += recording.sessions.len();
     }
-    let metrics = Metrics::of(&predictions, full_lock_deg)
-        .ok_or_else(|| Error::Usage("no image of these recordings can be decoded".into()))?;
+    let metrics = Metrics::of(&predictions, full_lock_deg).ok_or_else(|| {
+        Error::Usage("these recordings have no row that can be used; `steersman inspect` says why".into())
+    })?;
     if known > 0 {
         eprintln!(
             "note: {known} of {} rows belong to the model's training split: this is no test of how well it generalises",

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use super::print_json;
+use super::{print, print_json};
 use crate::dataset::inspect::report;
 use crate::error::Result;
 
@@ -24,7 +24,7 @@ pub fn run(args: InspectArgs) -> Result<()> {
     for path in &args.recordings {
         let report = report(path)?;
         if !args.json {
-            println!("{report}");
+            print(&format!("{report}\n"))?;
         }
         reports.push(report);
     }

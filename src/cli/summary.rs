@@ -3,11 +3,14 @@
 use std::path::PathBuf;
 
 use clap::Args;
+use serde::Serialize;
 use steersman_kernels::Isa;
 
-use super::RecipeArgs;
+use super::{RecipeArgs, print, print_json};
 use crate::error::Result;
 use crate::model_file::Model;
+use crate::network::{NamedLayer, Network};
+use crate::recipe::Recipe;
 
 /// Print the layer table of a recipe or a model
 #[derive(Debug, Args)]
@@ -17,20 +20,67 @@ pub struct SummaryArgs {
     model: Option<PathBuf>,
     #[command(flatten)]
     recipe: RecipeArgs,
+    /// Print one JSON object as the last line
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Serialize)]
+struct Table {
+    recipe: String,
+    layers: Vec<Row>,
+    params: usize,
+    trainable_params: usize,
+    non_trainable_params: usize,
+    multiply_adds: u64,
+}
+
+#[derive(Serialize)]
+struct Row {
+    name: String,
+    kind: String,
+    /// Channels, height, width.
+    output: [usize; 3],
+    params: usize,
+    multiply_adds: u64,
+}
+
+impl Table {
+    fn of(recipe: &Recipe, network: &Network) -> Table {
+        let row = |named: &NamedLayer| Row {
+            name: named.name.clone(),
+            kind: named.spec.describe(),
+            output: [named.layer.output().c, named.layer.output().h, named.layer.output().w],
+            params: named.params.len() + named.statistics.len(),
+            multiply_adds: named.layer.multiply_adds(),
+        };
+        let (trainable_params, non_trainable_params) = (network.count(true), network.count(false));
+        Table {
+            recipe: recipe.name.clone(),
+            layers: network.layers().iter().map(row).collect(),
+            params: trainable_params + non_trainable_params,
+            trainable_params,
+            non_trainable_params,
+            multiply_adds: network.multiply_adds(),
+        }
+    }
 }
 
 pub fn run(args: SummaryArgs) -> Result<()> {
+    let mut heading = String::new();
     let recipe = match &args.model {
         Some(path) => {
             let model = Model::load(path)?;
-            println!("{}: recipe {}, {}", path.display(), model.recipe.name, training_line(&model));
+            heading = format!("{}: recipe {}, {}\n", path.display(), model.recipe.name, training_line(&model));
             model.recipe
         }
         None => args.recipe.find()?,
     };
-    println!("{}: {}\n", recipe.name, recipe.about);
-    print!("{}", recipe.network(Isa::best())?.summary());
-    Ok(())
+    let network = recipe.network(Isa::best())?;
+    if args.json {
+        return print_json(&Table::of(&recipe, &network));
+    }
+    print(&format!("{heading}{}: {}\n\n{}", recipe.name, recipe.about, network.summary()))
 }
 
 fn training_line(model: &Model) -> String {

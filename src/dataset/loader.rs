@@ -110,7 +110,7 @@ impl Loader {
         };
         let (training, validation) = (bytes(true, &split.training), bytes(false, &split.validation));
         let share = training as f64 / (training + validation).max(1) as f64;
-        let for_training = (spec.cache.memory_bytes as f64 * share) as usize;
+        let for_training = ((spec.cache.memory_bytes as f64 * share) as usize).min(spec.cache.memory_bytes);
         let with =
             |memory_bytes| LoaderSpec { cache: CacheSpec { memory_bytes, ..spec.cache.clone() }, ..spec.clone() };
         Ok((

@@ -14,6 +14,7 @@ use super::colour::Colour;
 use super::resize::{Interpolation, Resizer};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
+use steersman_kernels::Isa;
 
 /// Largest height or width of an image or of the network's input, in pixels.
 const MAX_SIDE: usize = 8192;
@@ -148,11 +149,7 @@ impl Preprocessing {
     /// # Panics
     /// If the lengths differ.
     pub fn to_input(&self, planes: &[u8], out: &mut [f32]) {
-        assert_eq!(planes.len(), out.len(), "network input");
-        let (scale, offset) = (self.scale as f32, self.offset as f32);
-        for (out, &grey) in out.iter_mut().zip(planes) {
-            *out = f32::from(grey) * scale + offset;
-        }
+        steersman_kernels::pixels::u8_to_f32(Isa::best(), planes, self.scale as f32, self.offset as f32, out);
     }
 }
 

@@ -1,6 +1,7 @@
 //! What is known of a recording once it is read: rows, sessions, and what had to be left out.
 
 use super::files::{Files, Name};
+use super::preprocess::Preprocessing;
 use crate::{Error, Result};
 use serde::Serialize;
 use sha2::{Digest, Sha256};
@@ -246,6 +247,16 @@ impl Recording {
             return Err(Error::data(&self.path, message));
         }
         Ok(())
+    }
+
+    /// What the user should know before the recording goes through `preprocessing`, each line with its place.
+    pub fn notices_for(&self, preprocessing: &Preprocessing) -> Vec<String> {
+        let unusable = self.unusable.rows();
+        let left_out =
+            (unusable > 0).then(|| format!("{unusable} of {} rows cannot be used and are left out", self.total_rows()));
+        let scaled = self.image_size.and_then(|size| preprocessing.size_notice(size));
+        let all = self.notices.iter().cloned().chain(left_out).chain(scaled);
+        all.map(|text| format!("{}: {text}", self.path.display())).collect()
     }
 
     /// Decides what the whole recording tells: cameras, times, sessions. Called once, when all rows are read;

@@ -108,7 +108,9 @@ impl Tub {
                 self.deleted += 1;
                 continue;
             }
-            let (time_ms, session) = (record.time_ms, record.session.clone());
+            // Times beyond the year 9999 are no times.
+            let time_ms = record.time_ms.filter(|ms| (0..=253_402_300_799_999).contains(ms));
+            let session = record.session.clone();
             return Ok(Some(TubLine { line: row(record, line), catalog, time_ms, session }));
         }
     }

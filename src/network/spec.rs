@@ -9,6 +9,12 @@ use crate::layers::{
 };
 use crate::tensor::{Initializer, Shape};
 
+/// Largest filters, units, kernel, window, stride.
+const MAX_SIZE: usize = 65_536;
+
+/// Most weights of a layer, and most numbers that one image has on its way: 1 GiB.
+const MAX_NUMBERS: usize = 1 << 28;
+
 /// One entry of a recipe's `layers`: `{ kind = "conv2d", filters = 8, kernel = [3, 3] }`.
 ///
 /// Pairs are (height, width). Layers are named by their kind and a number from 1: `conv1`, `bn1`, `conv2`.
@@ -178,8 +184,53 @@ impl LayerSpec {
         }
     }
 
+    /// Refuses sizes that no network of this kind has, before anything is computed from them.
+    fn check_sizes(&self, input: Shape) -> Result<(), String> {
+        let sizes = match *self {
+            LayerSpec::Conv2d { filters, kernel: [kh, kw], stride: [sh, sw], .. } => {
+                let weights = filters.saturating_mul(input.c).saturating_mul(kh).saturating_mul(kw);
+                let outputs = filters.saturating_mul(input.positions());
+                if weights.max(outputs) > MAX_NUMBERS {
+                    return Err(format!("weights or outputs would be more than {MAX_NUMBERS} numbers"));
+                }
+                vec![("filters", filters), ("kernel", kh), ("kernel", kw), ("stride", sh), ("stride", sw)]
+            }
+            LayerSpec::MaxPool { window: [h, w], stride } | LayerSpec::AveragePool { window: [h, w], stride } => {
+                let [sh, sw] = stride.unwrap_or([1, 1]);
+                vec![("window", h), ("window", w), ("stride", sh), ("stride", sw)]
+            }
+            LayerSpec::Dense { units, .. } => {
+                if units.saturating_mul(input.len()) > MAX_NUMBERS {
+                    return Err(format!("{units} units would have more than {MAX_NUMBERS} weights"));
+                }
+                vec![("units", units)]
+            }
+            LayerSpec::Crop { rows, columns } => {
+                [rows, columns].concat().into_iter().map(|size| ("rows and columns", size)).collect()
+            }
+            _ => vec![],
+        };
+        match sizes.iter().find(|(_, size)| *size > MAX_SIZE) {
+            Some((key, size)) => Err(format!("{key} must be at most {MAX_SIZE}, not {size}")),
+            None => Ok(()),
+        }
+    }
+
+    /// Refuses first values that are not finite.
+    fn check_first_values(&self) -> Result<(), String> {
+        let first = match *self {
+            LayerSpec::Conv2d { init: Initializer::Constant(value), .. }
+            | LayerSpec::Dense { init: Initializer::Constant(value), .. } => value,
+            LayerSpec::PRelu { initial_slope, .. } => initial_slope,
+            _ => 0.0,
+        };
+        if first.is_finite() { Ok(()) } else { Err(format!("first values must be finite, not {first}")) }
+    }
+
     /// The layer for inputs of shape `input`, or what does not fit.
     pub fn build(&self, input: Shape, isa: Isa) -> Result<Box<dyn Layer>, String> {
+        self.check_sizes(input)?;
+        self.check_first_values()?;
         Ok(match *self {
             LayerSpec::Conv2d { filters, kernel, stride, padding, init } => {
                 Box::new(Conv2d::new(input, filters, kernel, stride, padding, init, isa)?)

@@ -14,7 +14,7 @@ use steersman_kernels::{Isa, update};
 
 use super::{NamedLayer, Network, Parameters};
 use crate::layers::{BatchStatistics, Grads, Pair, Pass};
-use crate::training::Loss;
+use crate::loss::Loss;
 
 /// Most shards a batch is cut into: enough to keep 16 threads busy.
 pub const MAX_SHARDS: usize = 16;
@@ -112,7 +112,7 @@ impl TrainingPlan {
             (GROUP_NUMBERS / per_image.max(1)).clamp(MIN_GROUP.min(shard_capacity), shard_capacity)
         };
         let scratch_len = layers.iter().map(|l| l.layer.scratch_len(group)).max().unwrap_or(0);
-        let shards = (0..capacity.div_ceil(shard_capacity))
+        let shards = (0..capacity.min(MAX_SHARDS))
             .map(|_| Shard {
                 images: 0..0,
                 activations: layers.iter().map(|l| vec![0.0; group * activations_len(l)]).collect(),

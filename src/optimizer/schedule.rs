@@ -15,12 +15,11 @@ pub struct ScheduleSpec {
 }
 
 /// The learning rate as a multiple of the optimizer's.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
 pub enum Schedule {
     /// Always 1.
-    #[default]
-    Constant,
+    Constant {},
     /// `1 / (1 + decay_per_update · updates)`, which Keras 1 calls `decay`. It is no weight decay.
     TimeDecay {
         /// Growth of the divisor with each update.
@@ -42,6 +41,12 @@ pub enum Schedule {
         #[serde(default)]
         min_fraction: f64,
     },
+}
+
+impl Default for Schedule {
+    fn default() -> Schedule {
+        Schedule::Constant {}
+    }
 }
 
 /// What [`Schedule::ReduceOnPlateau`] remembers between epochs.
@@ -66,7 +71,7 @@ impl ScheduleSpec {
             warmup => ((updates + 1) as f64 / warmup as f64).min(1.0),
         };
         let shape = match self.shape {
-            Schedule::Constant => 1.0,
+            Schedule::Constant {} => 1.0,
             Schedule::TimeDecay { decay_per_update } => 1.0 / (1.0 + decay_per_update * updates as f64),
             Schedule::Cosine { final_fraction } => {
                 let progress = (updates as f64 / total_updates.max(1) as f64).min(1.0);
@@ -99,7 +104,7 @@ impl ScheduleSpec {
             false => Err(format!("{name} must lie in [0, 1], not be {value}")),
         };
         match self.shape {
-            Schedule::Constant => Ok(()),
+            Schedule::Constant {} => Ok(()),
             Schedule::TimeDecay { decay_per_update } if decay_per_update.is_finite() && decay_per_update >= 0.0 => {
                 Ok(())
             }
@@ -137,7 +142,7 @@ mod tests {
 
     #[test]
     fn warm_up_rises_in_a_line_and_reaches_the_full_rate() {
-        assert_eq!(fractions(Schedule::Constant, 4, &[0, 1, 3, 4]), [0.25, 0.5, 1.0, 1.0]);
+        assert_eq!(fractions(Schedule::Constant {}, 4, &[0, 1, 3, 4]), [0.25, 0.5, 1.0, 1.0]);
     }
 
     #[test]

@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 
-/// A labels counts as straight below this wheel angle, in degrees.
+/// A label counts as straight below this wheel angle, in degrees.
 const STRAIGHT_DEG: f64 = 1.0;
 
 /// What the model says of one row, and what the driver did.
@@ -14,7 +14,7 @@ pub struct Prediction {
     pub label: f32,
     /// Which unbroken drive the row belongs to.
     pub session: usize,
-    /// Time within the session, in seconds.
+    /// Time in seconds; only differences within a session count.
     pub time_s: f64,
 }
 

@@ -42,13 +42,15 @@ pub struct Progress {
     pub images: usize,
     /// Its training time so far.
     pub train_seconds: f64,
+    /// Learning rate of the last update.
+    pub learning_rate: f64,
     /// Which epoch the best weights are of, from 1.
     pub best_epoch: u32,
     /// Their validation loss.
     pub best_val_mse: Option<f64>,
     /// Epochs since the validation loss last improved by the recipe's `min_delta`, and what it was then.
     pub epochs_since_improvement: u32,
-    /// See above.
+    /// Validation loss at that improvement.
     pub improved_val_mse: Option<f64>,
     /// What the learning-rate schedule remembers.
     pub plateau: Plateau,

@@ -19,6 +19,7 @@ use crate::recipe::Recipe;
 pub struct Data {
     recordings: Arc<[Recording]>,
     split: Split,
+    leak: LeakAudit,
     loader: LoaderSpec,
     notices: Vec<String>,
 }
@@ -35,31 +36,26 @@ impl Data {
         for path in paths {
             let recording = dataset::load(path)?;
             recording.require_usable()?;
-            let mut notice = |text: &str| notices.push(format!("{}: {text}", path.display()));
-            for text in &recording.notices {
-                notice(text);
-            }
-            let unusable = recording.unusable.rows();
-            if unusable > 0 {
-                notice(&format!("{unusable} of {} rows cannot be used and are left out", recording.total_rows()));
-            }
-            if let Some(text) = recording.image_size.and_then(|size| recipe.preprocessing.size_notice(size)) {
-                notice(&text);
-            }
+            notices.extend(recording.notices_for(&recipe.preprocessing));
             recordings.push(recording);
         }
         let split = split(&recordings, &recipe.split, &recipe.samples, &recipe.balance, seed)?;
         notices.push(split.summary());
-        notices.push(LeakAudit::of(&split, &recordings).summary());
+        let leak = LeakAudit::of(&split, &recordings);
+        notices.push(leak.summary());
         let loader = LoaderSpec {
             preprocessing: recipe.preprocessing.clone(),
             samples: recipe.samples.clone(),
             augmentation: recipe.augmentation.clone(),
             batch: recipe.batch,
             seed,
-            cache: CacheSpec { memory_bytes: cache_mib << 20, overflow: Overflow::File, folder: None },
+            cache: CacheSpec {
+                memory_bytes: cache_mib.saturating_mul(1 << 20),
+                overflow: Overflow::File,
+                folder: None,
+            },
         };
-        Ok(Data { recordings: recordings.into(), split, loader, notices })
+        Ok(Data { recordings: recordings.into(), split, leak, loader, notices })
     }
 
     /// What the user should know of the recordings and the split.
@@ -69,7 +65,7 @@ impl Data {
 
     /// Share of validation rows with a training row of the same session within a second, in percent.
     pub fn leak_percent(&self) -> f64 {
-        100.0 * LeakAudit::of(&self.split, &self.recordings).share()
+        100.0 * self.leak.share()
     }
 
     /// [`Recording::row_id`] of each training row, sorted.

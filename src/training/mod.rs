@@ -7,22 +7,21 @@
 //! | `split.csv` | which row went to which side |
 //! | `history.csv` | one line an epoch |
 //! | `model.safetensors` | the best model, by validation loss |
-//! | `last.safetensors` | the model of the last epoch |
+//! | `last.safetensors` | the model of the last epoch; with early stopping, in the end the best one |
 //! | `checkpoint.safetensors` | where the run stands |
 //! | `result.json` | what `train --json` prints; its presence says that the run is finished |
 
 mod checkpoint;
 mod data;
 mod history;
-mod loss;
 mod run_folder;
 mod session;
 mod validation;
 
+pub use crate::loss::Loss;
 pub use checkpoint::{Progress, State};
 pub use data::Data;
 pub use history::{EpochRecord, write_history};
-pub use loss::Loss;
 pub use run_folder::RunFolder;
 pub use session::{Observer, TrainRequest, TrainResult, resume, train};
 pub use validation::{Validation, ValidationResult};

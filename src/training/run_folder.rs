@@ -69,11 +69,6 @@ impl RunFolder {
         (1..).map(|n| Path::new("runs").join(format!("{name}-{n}"))).find(|path| !path.exists()).expect("numbers go on")
     }
 
-    /// The folder itself.
-    pub fn path(&self) -> &Path {
-        &self.path
-    }
-
     /// A file in the folder.
     pub fn file(&self, name: &str) -> PathBuf {
         self.path.join(name)
@@ -97,7 +92,7 @@ impl RunFolder {
     }
 
     pub(super) fn write_recipe(&self, recipe: &Recipe) -> Result<()> {
-        atomic_file::write(&self.file("recipe.toml"), recipe.to_toml().as_bytes())
+        atomic_file::write(&self.file("recipe.toml"), recipe.to_toml()?.as_bytes())
     }
 
     pub(super) fn read_recipe(&self) -> Result<Recipe> {

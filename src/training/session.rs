@@ -163,7 +163,9 @@ impl Session {
         let (leak_percent, training_rows) = (data.leak_percent(), data.training_row_ids());
         let notices = data.notices().to_vec();
         let (training, validation) = data.into_loaders()?;
-        let capacity = recipe.batch.max(IMAGES_OF_A_ROW);
+        // No batch is larger than a side has samples, whatever the recipe asks for.
+        let most = training.samples().max(validation.as_ref().map_or(0, Loader::samples));
+        let capacity = recipe.batch.min(most).max(IMAGES_OF_A_ROW);
         Ok(Session {
             plan: TrainingPlan::new(&network, capacity),
             validation: validation.map(|loader| Validation::new(loader, &network, capacity, recipe.full_lock_deg)),
@@ -194,19 +196,26 @@ impl Session {
             observer.notice(notice);
         }
         let seconds_before = self.state.progress.seconds;
-        let mut nothing_decoded = true;
+        let mut images_unreported = true;
         let mut batches = [Batch::default(), Batch::default()];
         while self.state.progress.epoch < self.recipe.epochs && !self.stop_early() {
             let epoch_started = Instant::now();
-            // In the first epoch of this process every image is decoded.
-            let first_here = std::mem::take(&mut nothing_decoded);
-            let learning_rate = self.train_epoch(&mut batches, observer, stop, seconds_before)?;
+            // In the first whole epoch of this process every image is decoded.
+            let whole = self.state.progress.next_batch == 0;
+            self.train_epoch(&mut batches, observer, stop, seconds_before)?;
+            if self.state.progress.images == 0 {
+                let examples = self.training.undecodable().1.join("; ");
+                return Err(Error::Usage(format!("no training image can be decoded: {examples}")));
+            }
             let validation = match &mut self.validation {
                 Some(validation) => validation.run(&self.network, &self.state.parameters)?,
                 None => None,
             };
-            self.end_epoch(learning_rate, validation, epoch_started, observer);
-            if first_here {
+            if validation.is_some_and(|v| !v.mse.is_finite()) {
+                return Err(self.diverged("the validation loss is not finite"));
+            }
+            self.end_epoch(validation, epoch_started, observer);
+            if whole && std::mem::take(&mut images_unreported) {
                 self.report_images(observer);
             }
             self.state.progress.seconds = seconds_before + self.started.elapsed().as_secs_f64();
@@ -216,21 +225,20 @@ impl Session {
         self.finish()
     }
 
-    /// Trains the rest of the epoch under way; returns the last learning rate.
+    /// Trains the rest of the epoch under way.
     fn train_epoch(
         &mut self,
         [current, next]: &mut [Batch; 2],
         observer: &mut dyn Observer,
         stop: &AtomicBool,
         seconds_before: f64,
-    ) -> Result<f64> {
+    ) -> Result<()> {
         let epoch = self.state.progress.epoch;
         let seconds_of_epoch_before = self.state.progress.train_seconds;
         let started = Instant::now();
         self.training.begin_epoch(epoch);
         let batches = self.training.batches();
         let updates_in_all = batches as u64 * u64::from(self.recipe.epochs);
-        let mut learning_rate = self.learning_rate(updates_in_all);
         if self.state.progress.next_batch < batches {
             self.training.fill(self.state.progress.next_batch, current)?;
         }
@@ -252,19 +260,14 @@ impl Session {
                 || if following < batches { training.fill(following, next) } else { Ok(()) },
             );
             filled?;
-            if !mean_loss.is_finite() {
-                return Err(Error::Usage(format!(
-                    "training diverged in epoch {}: the loss is {mean_loss}. Try a smaller learning rate, as in --set \
-                     optimizer.learning_rate={:e}",
-                    epoch + 1,
-                    self.recipe.optimizer.learning_rate() / 10.0
-                )));
-            }
             if current.n > 0 {
-                let fraction = self.recipe.schedule.fraction(optimizer.updates, updates_in_all, &progress.plateau);
-                learning_rate = self.recipe.optimizer.learning_rate() * fraction;
                 let norm = plan.gradient_norm();
-                optimizer.step(learning_rate, &mut parameters.values, plan.gradient_mut(), norm);
+                if !(mean_loss.is_finite() && norm.is_finite()) {
+                    return Err(self.diverged("the loss or its gradient is not finite"));
+                }
+                let fraction = self.recipe.schedule.fraction(optimizer.updates, updates_in_all, &progress.plateau);
+                progress.learning_rate = self.recipe.optimizer.learning_rate() * fraction;
+                optimizer.step(progress.learning_rate, &mut parameters.values, plan.gradient_mut(), norm);
             }
             progress.loss_sum += mean_loss * current.n as f64;
             progress.images += current.n;
@@ -278,22 +281,18 @@ impl Session {
                 return Err(Error::Interrupted);
             }
         }
-        Ok(learning_rate)
+        Ok(())
     }
 
-    fn learning_rate(&self, updates_in_all: u64) -> f64 {
-        let State { optimizer, progress, .. } = &self.state;
-        let fraction = self.recipe.schedule.fraction(optimizer.updates, updates_in_all, &progress.plateau);
-        self.recipe.optimizer.learning_rate() * fraction
+    fn diverged(&self, what: &str) -> Error {
+        Error::Usage(format!(
+            "training diverged in epoch {}: {what}. Try a smaller learning rate, as in --set optimizer.learning_rate={:e}",
+            self.state.progress.epoch + 1,
+            self.recipe.optimizer.learning_rate() / 10.0
+        ))
     }
 
-    fn end_epoch(
-        &mut self,
-        learning_rate: f64,
-        validation: Option<ValidationResult>,
-        started: Instant,
-        observer: &mut dyn Observer,
-    ) {
+    fn end_epoch(&mut self, validation: Option<ValidationResult>, started: Instant, observer: &mut dyn Observer) {
         let State { parameters, best, progress, .. } = &mut self.state;
         let record = EpochRecord {
             epoch: progress.epoch + 1,
@@ -302,7 +301,7 @@ impl Session {
             val_center_mse: validation.map(|v| v.center_mse),
             val_mae_deg: validation.map(|v| v.mae_deg),
             relative_to_zero: validation.and_then(|v| v.relative_to_zero),
-            learning_rate,
+            learning_rate: progress.learning_rate,
             images: progress.images,
             train_seconds: progress.train_seconds,
             seconds: started.elapsed().as_secs_f64().max(progress.train_seconds),
@@ -339,15 +338,20 @@ impl Session {
         patience.is_some_and(|patience| self.state.progress.epochs_since_improvement >= patience)
     }
 
+    /// Writes the checkpoint and the models. The weights are those of the last epoch that is done.
     fn save_checkpoint(&self) -> Result<()> {
+        self.save_with_last(self.state.progress.history.len() as u32)
+    }
+
+    /// The same, where the weights are those after `epoch` (from 1).
+    fn save_with_last(&self, epoch: u32) -> Result<()> {
         self.state.save(&self.folder.file("checkpoint.safetensors"), &self.network)?;
         if let Some(best) = &self.state.best {
             let progress = &self.state.progress;
             self.model(best, progress.best_epoch).save(&self.folder.model())?;
-            let last = progress.history.len() as u32;
             // In the middle of an epoch the weights belong to no epoch's figures; the checkpoint has them.
             if progress.next_batch == 0 {
-                self.model(&self.state.parameters, last).save(&self.folder.file("last.safetensors"))?;
+                self.model(&self.state.parameters, epoch).save(&self.folder.file("last.safetensors"))?;
             }
         }
         Ok(())
@@ -386,10 +390,12 @@ impl Session {
     }
 
     fn finish(mut self) -> Result<TrainResult> {
+        let mut epoch_of_weights = self.state.progress.history.len() as u32;
         if self.recipe.early_stopping.is_some()
             && let Some(best) = &self.state.best
         {
             self.state.parameters.clone_from(best);
+            epoch_of_weights = self.state.progress.best_epoch;
         }
         let progress = &self.state.progress;
         let best = progress.history[progress.best_epoch as usize - 1];
@@ -414,7 +420,7 @@ impl Session {
             weights_hash: weights_hash(&self.network, &self.state.parameters),
             leak_percent: self.leak_percent,
         };
-        self.save_checkpoint()?;
+        self.save_with_last(epoch_of_weights)?;
         self.folder.write_json("result.json", &result)?;
         Ok(result)
     }

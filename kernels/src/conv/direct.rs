@@ -2,8 +2,9 @@
 //!
 //! A tile is 8 output channels by 3 vectors: 24 accumulators. For each tap it loads 3 vectors of the input, shifted by
 //! the offset of the tap, and multiplies them by 8 weights: 11 loads for 24 multiply-adds, so arithmetic is the limit.
-//! With 16 registers a tile has 6 channels by 2 vectors, which leaves the compiler a register to spare. Each output is one chain of multiply-adds in the order of the taps, whatever
-//! the tile it falls in, so it does not depend on the number of images.
+//! With 16 registers a tile has 6 channels by 2 vectors, which leaves the compiler a register to spare. Each output is
+//! one chain of multiply-adds in the order of the taps, whatever the tile it falls in, so it does not depend on the
+//! number of images.
 
 use super::grid::Span;
 use crate::simd::Simd;

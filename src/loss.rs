@@ -3,17 +3,22 @@
 use serde::{Deserialize, Serialize};
 
 /// What training makes small. Both are means over the batch, as in Keras.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
 pub enum Loss {
     /// Mean of `(prediction − label)²`.
-    #[default]
-    MeanSquaredError,
+    MeanSquaredError {},
     /// Mean of the Huber loss (1964): `error² / 2` for `|error| ≤ delta`, else `delta · (|error| − delta / 2)`.
     Huber {
         /// Where the square turns into a line, in units of the label.
         delta: f32,
     },
+}
+
+impl Default for Loss {
+    fn default() -> Loss {
+        Loss::MeanSquaredError {}
+    }
 }
 
 impl Loss {
@@ -29,7 +34,7 @@ impl Loss {
         for ((gradient, prediction), label) in gradient.iter_mut().zip(predictions).zip(labels) {
             let error = prediction - label;
             let (value, derivative) = match *self {
-                Loss::MeanSquaredError => (error * error, 2.0 * error),
+                Loss::MeanSquaredError {} => (error * error, 2.0 * error),
                 Loss::Huber { delta } if error.abs() <= delta => (error * error / 2.0, error),
                 Loss::Huber { delta } => (delta * (error.abs() - delta / 2.0), delta * error.signum()),
             };
@@ -47,7 +52,7 @@ mod tests {
     #[test]
     fn values_are_those_of_the_formulas() {
         let (predictions, labels, mut gradient) = ([1.0, -3.0], [0.5, 0.0], [f32::NAN; 2]);
-        let mse = Loss::MeanSquaredError.value_and_gradient(&predictions, &labels, 0.5, &mut gradient);
+        let mse = Loss::MeanSquaredError {}.value_and_gradient(&predictions, &labels, 0.5, &mut gradient);
         assert_eq!((mse, gradient), (0.25 + 9.0, [0.5, -3.0]));
         let huber = Loss::Huber { delta: 1.0 }.value_and_gradient(&predictions, &labels, 1.0, &mut gradient);
         assert_eq!((huber, gradient), (0.125 + 2.5, [0.5, -1.0]));
@@ -55,7 +60,7 @@ mod tests {
 
     #[test]
     fn gradients_are_the_slopes_of_the_values() {
-        for loss in [Loss::MeanSquaredError, Loss::Huber { delta: 0.5 }] {
+        for loss in [Loss::MeanSquaredError {}, Loss::Huber { delta: 0.5 }] {
             for prediction in [-1.7f32, -0.4, 0.1, 0.45, 2.0] {
                 let value = |p: f32| loss.value_and_gradient(&[p], &[0.2], 1.0, &mut [0.0]);
                 let (up, down) = (prediction + 1e-3, prediction - 1e-3);
