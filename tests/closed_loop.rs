@@ -51,7 +51,11 @@ fn what_is_learned_from_the_expert_drives_and_does_so_alike_for_any_number_of_th
     let zero = drive(&Track::load("lake").unwrap(), new_zero, &options, &|_| true).unwrap().summary;
     eprintln!(
         "offline {:.2} deg; autonomy {:.1} % (zero {:.1} %), way {:.0} m (zero {:.0} m)",
-        lake.offline_mae_deg, lake.drive.autonomy_percent, zero.autonomy_percent, lake.drive.distance_m, zero.distance_m
+        lake.offline_mae_deg,
+        lake.drive.autonomy_percent,
+        zero.autonomy_percent,
+        lake.drive.distance_m,
+        zero.distance_m
     );
     assert!(result.relative_to_zero.unwrap() < 0.8, "{result:?}");
     assert!(lake.drive.distance_m > 2.0 * zero.distance_m);
