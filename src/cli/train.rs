@@ -41,7 +41,7 @@ pub struct TrainArgs {
     #[arg(long, value_name = "RUN", conflicts_with_all = ["recordings", "recipe", "overrides", "out", "seed", "cache"])]
     resume: Option<PathBuf>,
     /// Without a recording: runs of the finished model on each track, of one lap
-    #[arg(long, default_value_t = 2, conflicts_with_all = ["recordings", "resume"])]
+    #[arg(long, default_value_t = 1, conflicts_with_all = ["recordings", "resume"])]
     runs: usize,
     /// Train on recordings of held-out tracks all the same
     #[arg(long)]
