@@ -124,6 +124,14 @@ mod tests {
     }
 
     #[test]
+    fn the_average_of_a_window_is_its_mean() {
+        let layer = AveragePool::new(Shape::new(1, 2, 2), [2, 2], [2, 2], Isa::best()).unwrap();
+        let mut y = [f32::NAN; 1];
+        layer.infer(&[], &[], 1, &[1.0, 2.0, 3.0, 6.0], &mut y, &mut []);
+        assert_eq!(y, [3.0]);
+    }
+
+    #[test]
     fn the_first_of_equal_maxima_gets_the_gradient() {
         let layer = MaxPool::new(Shape::new(1, 2, 2), [2, 2], [2, 2], Isa::best()).unwrap();
         let pass = Pass { seed: 0, step: 0, layer: 0, first_image: 0, moments: &[] };

@@ -12,8 +12,8 @@ use crate::tensor::{Initializer, Shape};
 /// Largest filters, units, kernel, window, stride.
 const MAX_SIZE: usize = 65_536;
 
-/// Most weights of a layer, and most numbers that one image has on its way: 1 GiB.
-const MAX_NUMBERS: usize = 1 << 28;
+/// Most weights of a layer, and most numbers that one image has on its way: 256 MiB.
+const MAX_NUMBERS: usize = 1 << 26;
 
 /// One entry of a recipe's `layers`: `{ kind = "conv2d", filters = 8, kernel = [3, 3] }`.
 ///
