@@ -44,7 +44,7 @@ pub struct MainJobResult {
 ///
 /// # Errors
 ///
-/// As [`drive`].
+/// As [`drive()`].
 pub fn test_on_track(
     pilot: &Pilot,
     track: &Track,
