@@ -87,7 +87,8 @@ pub fn run(args: TrainArgs) -> Result<()> {
     };
     match result {
         Ok(training) if whole_job => {
-            let drives = pool.install(|| drives(&training, args.runs, &stop))?;
+            let last = folder.join("last.safetensors");
+            let drives = pool.install(|| drives(&last, args.runs, &stop))?;
             let result = MainJobResult { training, drives };
             if args.json {
                 return print_json(&result);
@@ -97,7 +98,7 @@ pub fn run(args: TrainArgs) -> Result<()> {
             println!(
                 "\nall of it took {:.0} s; drive with: steersman drive {} --track coast",
                 started.elapsed().as_secs_f64(),
-                result.training.model.display()
+                last.display()
             );
             Ok(())
         }
@@ -129,9 +130,10 @@ fn training_set(stop: &AtomicBool) -> Result<Vec<PathBuf>> {
     Ok(paths)
 }
 
-/// Drives the model of `training` on every track of the main job.
-fn drives(training: &TrainResult, runs: usize, stop: &AtomicBool) -> Result<Vec<TrackResult>> {
-    let pilot = Pilot::load(&training.model)?;
+/// Drives `model` on every track of the main job. It gets the weights of the last epoch: those with the lowest validation
+/// error may be an early epoch's, which predicts well and drives badly.
+fn drives(model: &Path, runs: usize, stop: &AtomicBool) -> Result<Vec<TrackResult>> {
+    let pilot = Pilot::load(model)?;
     let options = DriveOptions { runs, ..Default::default() };
     let on_track = |name: &&str| {
         let track = Track::load(name)?;
