@@ -1,11 +1,11 @@
-//! Random changes to training images: a horizontal shift, a shadow, colours, brightness. Validation and driving never see
+//! Random changes to training images: a horizontal shift, a shadow, lines, colours, brightness. Validation and driving never see
 //! them.
 //!
 //! They act on the RGB stage of preprocessing (cropped, before the colour conversion), in this order: shift, shadow,
-//! colours, brightness. Each is drawn anew for every sample and epoch.
+//! lines, colours, brightness. Each is drawn anew for every sample and epoch.
 
 use super::preprocess::Preprocessing;
-use crate::random::{uniform, unit};
+use crate::random::{below, uniform, unit};
 use crate::{Error, Result};
 use rand::Rng;
 use serde::{Deserialize, Serialize};
@@ -21,6 +21,11 @@ pub struct Augmentation {
     pub shadow_probability: f64,
     /// Range of the factor that grey levels in the shadow are multiplied by; smaller is darker.
     pub shadow_strength: [f64; 2],
+    /// Largest number of straight lines across the picture that are darkened or lightened: seams, wires, wheel tracks, of which
+    /// none is the edge of the road.
+    pub lines: u32,
+    /// Range of the factor that grey levels in a line are multiplied by (clamped at 255).
+    pub line_strength: [f64; 2],
     /// Largest shift to the left or right, in source pixels. The edge column fills what comes into view.
     pub shift_px: f64,
     /// Steering added for each source pixel that the picture moves to the right: the road seems to lie to the right,
@@ -46,6 +51,8 @@ impl Default for Augmentation {
             brightness: None,
             shadow_probability: 0.0,
             shadow_strength: [0.2, 0.5],
+            lines: 0,
+            line_strength: [0.4, 1.6],
             shift_px: 0.0,
             shift_steering_per_px: None,
             hue_deg: 0.0,
@@ -59,7 +66,11 @@ impl Default for Augmentation {
 impl Augmentation {
     /// Whether anything is changed at all.
     pub fn is_active(&self) -> bool {
-        self.brightness.is_some() || self.shadow_probability > 0.0 || self.shift_px > 0.0 || self.changes_colours()
+        self.brightness.is_some()
+            || self.shadow_probability > 0.0
+            || self.shift_px > 0.0
+            || self.lines > 0
+            || self.changes_colours()
     }
 
     fn changes_colours(&self) -> bool {
@@ -76,12 +87,16 @@ impl Augmentation {
         let ranges = [
             ("brightness", self.brightness),
             ("shadow_strength", Some(self.shadow_strength)),
+            ("line_strength", Some(self.line_strength)),
             ("saturation", self.saturation),
             ("tint", self.tint),
             ("contrast", self.contrast),
         ];
         if let Some((key, _)) = ranges.into_iter().find(|(_, range)| !range.is_none_or(is_range)) {
             return wrong(key, "must be [low, high] with 0 <= low <= high <= 10");
+        }
+        if self.lines > 100 {
+            return wrong("lines", "must be 0 to 100");
         }
         if !(0.0..=180.0).contains(&self.hue_deg) {
             return wrong("hue_deg", "must be 0 to 180");
@@ -116,6 +131,12 @@ impl Augmentation {
             if chance < self.shadow_probability {
                 shadow(rgb, width, top, bottom, side < 0.5, &factors(factor));
             }
+        }
+        for _ in 0..below(rng, self.lines as usize + 1) {
+            // From anywhere at the horizon or beside the picture to anywhere near the car.
+            let [top, bottom, wide] = [unit(rng), uniform(rng, -1.0, 2.0), unit(rng)];
+            let table = factors(uniform(rng, self.line_strength[0], self.line_strength[1]));
+            line(rgb, width, top, bottom, wide, &table);
         }
         if self.changes_colours() {
             let drawn = |range: Option<[f64; 2]>, rng: &mut _| {
@@ -168,6 +189,19 @@ fn shadow(rgb: &mut [u8], width: usize, top: f64, bottom: f64, left: bool, table
         let (before, after) = row.split_at_mut(edge);
         let dark = if left { before } else { after };
         dark.iter_mut().for_each(|grey| *grey = table[usize::from(*grey)]);
+    }
+}
+
+/// Darkens or lightens a line from `top` at the upper rim to `bottom` at the lower, both shares of the width. It is drawn in
+/// perspective: fine above, up to 4 pixels wide below for `wide` 1.
+fn line(rgb: &mut [u8], width: usize, top: f64, bottom: f64, wide: f64, table: &[u8; 256]) {
+    let rows = rgb.len() / (width * 3);
+    for (y, row) in rgb.chunks_exact_mut(width * 3).enumerate() {
+        let along = (y as f64 + 0.5) / rows as f64;
+        let from = (top + (bottom - top) * along) * width as f64;
+        let to = from + 0.7 + 3.3 * wide * along;
+        let [from, to] = [from, to].map(|column| column.round().clamp(0.0, width as f64) as usize * 3);
+        row[from..to].iter_mut().for_each(|grey| *grey = table[usize::from(*grey)]);
     }
 }
 
@@ -252,6 +286,23 @@ mod tests {
         }
         // A line near the border can leave the picture as it is, so a few less than 500.
         assert!((400..=560).contains(&shadows), "{shadows}");
+    }
+
+    #[test]
+    fn lines_are_narrow_and_not_more_than_asked_for() {
+        let lines = Augmentation { lines: 2, line_strength: [0.5, 0.5], ..Default::default() };
+        assert!(lines.is_active());
+        let mut seen = std::collections::BTreeSet::new();
+        for stream in 0..500 {
+            let mut rgb = vec![100; 4 * 10 * 3];
+            assert_eq!(lines.apply(&preprocessing(), &mut rgb, &mut rng(3, Purpose::Test, 0, stream)), 0.0);
+            // Where two lines cross, grey levels are halved twice.
+            assert!(rgb.iter().all(|grey| [100, 50, 25].contains(grey)));
+            let dark = rgb.chunks_exact(30).map(|row| row.iter().filter(|&&grey| grey < 100).count() / 3).max();
+            assert!(dark <= Some(8), "{dark:?}");
+            seen.insert(dark);
+        }
+        assert!(seen.contains(&Some(0)) && seen.len() > 3, "{seen:?}");
     }
 
     #[test]

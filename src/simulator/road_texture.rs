@@ -212,6 +212,17 @@ fn surface(look: &Look, along: f32, across: f32, seed: u32) -> [f32; 3] {
             let joint = fu.min(1.0 - fu).min((fv.min(1.0 - fv)) * 0.64) < 0.05;
             scaled(look.tone, if joint { 0.5 } else { stone + look.grain * 0.5 * fine })
         }
+        Surface::Seamed => {
+            // Seams wander a little; where they lie and how dark they are differs from look to look.
+            let drawn = |k: i32| hash2(k, 0, seed + 60);
+            let wander = 0.25 * grain(along, across, 1.5, 4.0, seed + 61);
+            let lane_m = 1.6 + 2.4 * drawn(0);
+            let beside = (across + wander + lane_m * drawn(1)).rem_euclid(lane_m);
+            let bays = 1.0 + (6.0 * drawn(2)).floor();
+            let before = (along + wander + PERIOD_M * drawn(3)).rem_euclid(PERIOD_M / bays);
+            let seam = beside < 0.03 + 0.08 * drawn(4) || before < 0.12 + 0.2 * drawn(5);
+            scaled(look.tone, if seam { plain * (0.4 + 0.4 * drawn(6)) } else { plain })
+        }
         Surface::Concrete => {
             let slab = (along / 6.0).floor() as i32;
             let tint = 0.95 + 0.1 * hash2(slab, i32::from(across > 0.0), seed + 40);
