@@ -7,7 +7,7 @@ and held in memory. Each seed is a process of its own, so that its seconds are t
 
     python keras_lenet.py path/to/recording [--seeds 1 2 3 4 5]
 
-Needs the packages of tests/golden/requirements.txt.
+Needs the packages of requirements.txt.
 """
 
 import argparse
