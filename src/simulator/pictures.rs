@@ -85,7 +85,8 @@ impl Picture {
                     let four = [0, 1, 2 * w, 2 * w + 1].map(|o| fine[2 * v * 2 * w + 2 * u + o]);
                     let weight: u32 = four.iter().map(|t| t >> 24).sum();
                     let channel = |s: u32| four.iter().map(|t| (t >> s & 255) * (t >> 24)).sum::<u32>() / weight.max(1);
-                    channel(0) | channel(8) << 8 | channel(16) << 16 | (weight / 3).min(255) << 24
+                    // More than the mean, so that thin trunks do not vanish from afar.
+                    channel(0) | channel(8) << 8 | channel(16) << 16 | (weight * 2 / 5).min(255) << 24
                 })
                 .collect();
             levels.push(coarse);
