@@ -10,12 +10,14 @@ use super::light::Variant;
 use super::noise::SteeringNoise;
 use super::renderer::Renderer;
 use super::simulation::{Simulation, Start};
-use super::speed::{Speed, SpeedController};
+use super::speed::{Speed, SpeedController, as_telemetry};
 use super::track::Track;
 use crate::Result;
 
 /// Frames that a driver sees in each second. At 50 steps a second they come after 3 and 2 steps in turn.
 pub const DRIVE_HZ: u64 = 20;
+/// Time that the first frame of a drive is taken to stand for, s.
+pub const FIRST_DT_S: f64 = 1.0 / DRIVE_HZ as f64;
 /// Distance from the line at which an assisted run is interrupted, m (NVIDIA 2016).
 pub const INTERVENTION_M: f64 = 1.0;
 /// Time charged for an intervention, s (NVIDIA 2016).
@@ -29,7 +31,7 @@ const STANDING_LIMIT_S: f64 = 10.0;
 pub struct DriveState<'a> {
     /// The car on its track. A driver that is to be judged looks only at the picture and at the speed.
     pub simulation: &'a Simulation<'a>,
-    /// Speed, mph.
+    /// Speed as telemetry carries it, mph.
     pub speed_mph: f64,
 }
 
@@ -167,7 +169,7 @@ pub fn run(track: &Track, driver: &mut dyn Driver, options: &RunOptions, seed: u
     let slowest_mps = 0.25 * options.speed.at_start_mps().max(2.0);
     let most_steps = ((way_m / slowest_mps + 60.0) * STEPS_PER_S as f64) as u64;
     let mut controls = Controls::default();
-    let (mut shown, mut frames, mut steering) = (0, 0, 0.0);
+    let (mut shown_s, mut frames, mut steering) = (0.0, 0, 0.0);
     let (mut off_steps, mut standing_steps) = (0u64, 0u64);
     let mut put_back = false;
     let mut result = Run {
@@ -184,8 +186,9 @@ pub fn run(track: &Track, driver: &mut dyn Driver, options: &RunOptions, seed: u
     while simulation.progress_m < way_m && simulation.steps < most_steps && result.failure.is_none() {
         let step = simulation.steps;
         if step * DRIVE_HZ >= frames * STEPS_PER_S {
-            let dt_s = if frames == 0 { 1.0 / DRIVE_HZ as f64 } else { (step - shown) as f64 * STEP_S };
-            let speed_mph = simulation.car.speed_mps / MPS_PER_MPH;
+            let time_s = simulation.time_s();
+            let dt_s = if frames == 0 { FIRST_DT_S } else { time_s - shown_s };
+            let speed_mph = as_telemetry(simulation.car.speed_mps / MPS_PER_MPH);
             let frame = match &mut eye {
                 Some(eye) => eye.look(&simulation)?,
                 None => &blank,
@@ -201,7 +204,7 @@ pub fn run(track: &Track, driver: &mut dyn Driver, options: &RunOptions, seed: u
             pending.push_back((step + latency_steps, answer + noise.next(dt_s)));
             controls.throttle = controller.throttle(options.speed.target_mph(&simulation), speed_mph, dt_s);
             result.moments.push(Moment {
-                time_s: simulation.time_s(),
+                time_s,
                 x: simulation.car.x,
                 y: simulation.car.y,
                 s_m: simulation.location.s_m,
@@ -211,7 +214,7 @@ pub fn run(track: &Track, driver: &mut dyn Driver, options: &RunOptions, seed: u
                 speed_mph,
                 intervention: std::mem::take(&mut put_back),
             });
-            (shown, frames) = (step, frames + 1);
+            (shown_s, frames) = (time_s, frames + 1);
         }
         while pending.front().is_some_and(|(at, _)| *at <= step) {
             controls.steering = pending.pop_front().map_or(0.0, |(_, value)| value);
