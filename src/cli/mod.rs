@@ -11,6 +11,7 @@ mod predict;
 mod progress;
 mod record;
 mod share_bar;
+mod sim;
 mod summary;
 mod train;
 
@@ -39,6 +40,7 @@ enum Command {
     Train(train::TrainArgs),
     Record(record::RecordArgs),
     Drive(drive::DriveArgs),
+    Sim(sim::SimArgs),
     Evaluate(evaluate::EvaluateArgs),
     Predict(predict::PredictArgs),
     Inspect(inspect::InspectArgs),
@@ -53,6 +55,7 @@ pub fn main() -> ExitCode {
         Command::Train(args) => train::run(args),
         Command::Record(args) => record::run(args),
         Command::Drive(args) => drive::run(args),
+        Command::Sim(args) => sim::run(args),
         Command::Evaluate(args) => evaluate::run(args),
         Command::Predict(args) => predict::run(args),
         Command::Inspect(args) => inspect::run(args),

@@ -2,4 +2,5 @@
 //!
 //! [`protocol`] holds the messages of both sides, without any input or output.
 
+pub mod client;
 pub mod protocol;

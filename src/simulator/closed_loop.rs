@@ -56,17 +56,7 @@ impl<'a> ClosedLoop<'a> {
             off_steps: 0,
             standing_steps: 0,
             put_back: false,
-            run: Run {
-                moments: Vec::new(),
-                laps_completed: 0,
-                distance_m: 0.0,
-                time_s: 0.0,
-                off_road_s: 0.0,
-                failure: None,
-                interventions: 0,
-                worst_cte_m: simulation.cte_m().abs(),
-                whiteness_sum: 0.0,
-            },
+            run: Run { worst_cte_m: simulation.cte_m().abs(), ..Run::default() },
             simulation,
         }
     }
@@ -122,6 +112,12 @@ impl<'a> ClosedLoop<'a> {
             intervention: std::mem::take(&mut self.put_back),
         });
         (self.shown, self.frames) = (step, self.frames + 1);
+    }
+
+    /// Hands commands to the car between frames: both act at once, and what was on its way is forgotten.
+    pub fn take_up(&mut self, steering: f32, throttle: f32) {
+        self.pending.clear();
+        self.controls = Controls { steering: sane(steering), throttle: sane(throttle) };
     }
 
     /// Moves the car by one step and judges where it is.

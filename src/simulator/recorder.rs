@@ -274,7 +274,7 @@ pub fn write_recording(
 }
 
 /// Creates `out` with its parents; refuses one that exists.
-pub(super) fn create_new_folder(out: &Path) -> Result<()> {
+pub(crate) fn create_new_folder(out: &Path) -> Result<()> {
     if let Some(parent) = out.parent().filter(|p| !p.as_os_str().is_empty()) {
         fs::create_dir_all(parent).map_err(Error::io(parent))?;
     }

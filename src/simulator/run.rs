@@ -7,6 +7,7 @@ use super::expert;
 use super::eye::Eye;
 use super::simulation::Simulation;
 use super::speed::{Speed, SpeedController, telemetry_mph};
+use super::statistics::quantile;
 use super::track::Track;
 use crate::Result;
 
@@ -98,7 +99,7 @@ pub struct Moment {
 }
 
 /// What one run of a driver came to.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Run {
     /// Moments at 20 Hz.
     pub moments: Vec<Moment>,
@@ -125,6 +126,25 @@ impl Run {
     pub fn autonomy_percent(&self) -> f64 {
         (100.0 * (1.0 - INTERVENTION_S * self.interventions as f64 / self.time_s.max(STEP_S))).max(0.0)
     }
+
+    /// Root mean square rate of the steering, deg/s.
+    pub fn whiteness_deg_s(&self) -> f64 {
+        (self.whiteness_sum / self.time_s.max(STEP_S)).sqrt()
+    }
+
+    /// Mean speed over the moments, mph.
+    pub fn mean_speed_mph(&self) -> f64 {
+        self.moments.iter().map(|m| m.speed_mph).sum::<f64>() / self.moments.len().max(1) as f64
+    }
+}
+
+/// Distance from the line over the moments of runs: mean, root mean square and 95th percentile, m.
+pub fn line_errors_m<'a>(moments: impl Iterator<Item = &'a Moment>) -> [f64; 3] {
+    let mut errors: Vec<f64> = moments.map(|m| m.cte_m.abs()).collect();
+    errors.sort_by(f64::total_cmp);
+    let n = errors.len().max(1) as f64;
+    let rms = (errors.iter().map(|e| e * e).sum::<f64>() / n).sqrt();
+    [errors.iter().sum::<f64>() / n, rms, quantile(&errors, 0.95)]
 }
 
 /// How a run is driven.
