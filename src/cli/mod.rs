@@ -12,6 +12,7 @@ mod progress;
 mod record;
 mod serve;
 mod share_bar;
+mod sim;
 mod summary;
 mod train;
 
@@ -41,6 +42,7 @@ enum Command {
     Record(record::RecordArgs),
     Drive(drive::DriveArgs),
     Serve(serve::ServeArgs),
+    Sim(sim::SimArgs),
     Evaluate(evaluate::EvaluateArgs),
     Predict(predict::PredictArgs),
     Inspect(inspect::InspectArgs),
@@ -56,6 +58,7 @@ pub fn main() -> ExitCode {
         Command::Record(args) => record::run(args),
         Command::Drive(args) => drive::run(args),
         Command::Serve(args) => serve::run(args),
+        Command::Sim(args) => sim::run(args),
         Command::Evaluate(args) => evaluate::run(args),
         Command::Predict(args) => predict::run(args),
         Command::Inspect(args) => inspect::run(args),

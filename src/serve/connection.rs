@@ -47,7 +47,7 @@ const QUICK_BEAT: Duration = Duration::from_millis(10);
 /// Beat of one that has time.
 const SLOW_BEAT: Duration = Duration::from_millis(200);
 /// Throttle that must move a car.
-const STRONG_THROTTLE: f64 = 0.2;
+const STRONG_THROTTLE: f32 = 0.2;
 /// Commands with a strong throttle after which a car must show it.
 const DEAF_AFTER: u32 = 40;
 

@@ -3,11 +3,7 @@
 use std::time::Instant;
 
 use super::protocol::Command;
-use crate::simulator::run::FIRST_DT_S;
 use crate::simulator::speed::{SpeedController, slower_in_bends_mph};
-
-/// Longest time between two frames that counts, s: after a pause the car is somewhere else.
-const MAX_DT_S: f64 = 0.5;
 
 /// How the car is driven.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -35,29 +31,26 @@ pub enum Clock {
     Simulated(f64),
 }
 
-impl Clock {
-    fn seconds_since(self, earlier: Clock) -> Option<f64> {
-        match (self, earlier) {
-            (Clock::Arrival(now), Clock::Arrival(then)) => Some(now.saturating_duration_since(then).as_secs_f64()),
-            (Clock::Simulated(now), Clock::Simulated(then)) => Some(now - then),
-            _ => None,
-        }
-    }
-}
-
 /// One drive of one client.
 #[derive(Clone, Debug)]
 pub struct Helm {
     options: HelmOptions,
     controller: SpeedController,
-    before: Option<Clock>,
+    began: Instant,
+    last_s: Option<f64>,
     last: Command,
 }
 
 impl Helm {
     /// For a drive that begins.
     pub fn new(options: HelmOptions) -> Helm {
-        Helm { options, controller: SpeedController::default(), before: None, last: Command::default() }
+        Helm {
+            options,
+            controller: SpeedController::default(),
+            began: Instant::now(),
+            last_s: None,
+            last: Command::default(),
+        }
     }
 
     /// The command for a frame taken at `clock`, for which the model said `steering`, at `speed_mph`.
@@ -65,28 +58,22 @@ impl Helm {
     /// A model that answers nonsense steers straight ahead. `drive` computes its commands alike, so without smoothing and
     /// slowing down a client on simulated time is driven to the same bits.
     pub fn command(&mut self, steering: f32, speed_mph: f64, clock: Clock) -> Command {
-        let dt_s = match self.before.and_then(|before| clock.seconds_since(before)) {
-            Some(dt_s) => dt_s.clamp(0.0, MAX_DT_S),
-            None => FIRST_DT_S,
+        let time_s = match clock {
+            Clock::Arrival(came) => came.saturating_duration_since(self.began).as_secs_f64(),
+            Clock::Simulated(time_s) => time_s,
         };
-        let mut steering = f64::from(steering);
-        steering = if steering.is_finite() { steering.clamp(-1.0, 1.0) } else { 0.0 };
-        if self.options.smooth_s > 0.0 && self.before.is_some() {
-            let share = 1.0 - (-dt_s / self.options.smooth_s).exp();
-            steering = self.last.steering + share * (steering - self.last.steering);
+        let mut steering = if steering.is_finite() { steering.clamp(-1.0, 1.0) } else { 0.0 };
+        if let Some(last_s) = self.last_s.filter(|_| self.options.smooth_s > 0.0) {
+            let share = 1.0 - (-(time_s - last_s).max(0.0) / self.options.smooth_s).exp();
+            steering = self.last.steering + share as f32 * (steering - self.last.steering);
         }
         let mut target_mph = self.options.speed_mph;
         if self.options.slower_in_bends {
-            target_mph = slower_in_bends_mph(target_mph, steering);
+            target_mph = slower_in_bends_mph(target_mph, f64::from(steering));
         }
-        let throttle = self.controller.throttle(target_mph, speed_mph, dt_s);
-        self.before = Some(clock);
+        let throttle = self.controller.throttle_at(time_s, target_mph, speed_mph);
+        self.last_s = Some(time_s);
         self.last = Command { steering, throttle };
-        self.last
-    }
-
-    /// The last command.
-    pub fn last(&self) -> Command {
         self.last
     }
 
@@ -98,8 +85,7 @@ impl Helm {
 
     /// A person drives: what the speed controller has summed up no longer means anything.
     pub fn release(&mut self) {
-        self.controller = SpeedController::default();
-        self.before = None;
+        *self = Helm::new(self.options);
     }
 }
 
@@ -108,13 +94,9 @@ mod tests {
     use super::*;
     use std::time::Duration;
 
-    fn helm(options: HelmOptions) -> Helm {
-        Helm::new(options)
-    }
-
     #[test]
     fn steering_is_clamped_and_nonsense_is_straight_ahead() {
-        let mut helm = helm(HelmOptions::default());
+        let mut helm = Helm::new(HelmOptions::default());
         for (model, command) in [(0.25, 0.25), (3.0, 1.0), (-3.0, -1.0), (f32::NAN, 0.0), (f32::INFINITY, 0.0)] {
             assert_eq!(helm.command(model, 15.0, Clock::Simulated(0.0)).steering, command);
         }
@@ -122,23 +104,24 @@ mod tests {
 
     #[test]
     fn throttle_is_that_of_the_drives_controller_on_the_same_clock() {
-        let mut helm = helm(HelmOptions::default());
+        let mut helm = Helm::new(HelmOptions::default());
         let mut controller = SpeedController::default();
-        let mut expected = controller.throttle(15.0, 14.2, FIRST_DT_S);
-        assert_eq!(helm.command(0.0, 14.2, Clock::Simulated(0.0)).throttle, expected);
-        expected = controller.throttle(15.0, 14.3, 0.06);
-        assert_eq!(helm.command(0.0, 14.3, Clock::Simulated(0.06)).throttle, expected);
-        let start = Instant::now();
+        for (time_s, mph) in [(0.0, 14.2), (0.06, 14.3), (0.1, 14.4)] {
+            let expected = controller.throttle_at(time_s, 15.0, mph);
+            assert_eq!(helm.command(0.0, mph, Clock::Simulated(time_s)).throttle, expected);
+        }
         let mut by_arrival = Helm::new(HelmOptions::default());
-        by_arrival.command(0.0, 14.2, Clock::Arrival(start));
-        let second = by_arrival.command(0.0, 14.3, Clock::Arrival(start + Duration::from_millis(60)));
-        assert!((second.throttle - expected).abs() < 1e-12);
+        let (start, mut controller) = (by_arrival.began, SpeedController::default());
+        for (ms, mph) in [(5, 14.2), (65, 14.3)] {
+            let throttle = by_arrival.command(0.0, mph, Clock::Arrival(start + Duration::from_millis(ms))).throttle;
+            assert!((throttle - controller.throttle_at(ms as f64 / 1e3, 15.0, mph)).abs() < 1e-6);
+        }
     }
 
     #[test]
     fn smoothing_reaches_a_step_after_some_time_constants_whatever_the_rate() {
         for dt_s in [0.01, 0.05] {
-            let mut helm = helm(HelmOptions { smooth_s: 0.1, ..Default::default() });
+            let mut helm = Helm::new(HelmOptions { smooth_s: 0.1, ..Default::default() });
             assert_eq!(helm.command(0.0, 15.0, Clock::Simulated(0.0)).steering, 0.0);
             let mut at = 0.0;
             let mut steering = 0.0;
@@ -146,14 +129,14 @@ mod tests {
                 at += dt_s;
                 steering = helm.command(1.0, 15.0, Clock::Simulated(at)).steering;
             }
-            assert!((steering - (1.0 - (-1.0_f64).exp())).abs() < 1e-6, "{dt_s}: {steering}");
+            assert!((steering - (1.0 - (-1.0_f32).exp())).abs() < 1e-5, "{dt_s}: {steering}");
         }
     }
 
     #[test]
     fn bends_are_taken_slower_if_wanted_and_the_throttle_can_be_cut() {
-        let plain = helm(HelmOptions::default()).command(0.6, 15.0, Clock::Simulated(0.0));
-        let mut slower = helm(HelmOptions { slower_in_bends: true, ..Default::default() });
+        let plain = Helm::new(HelmOptions::default()).command(0.6, 15.0, Clock::Simulated(0.0));
+        let mut slower = Helm::new(HelmOptions { slower_in_bends: true, ..Default::default() });
         let command = slower.command(0.6, 15.0, Clock::Simulated(0.0));
         assert!(command.throttle < plain.throttle - 0.1 && command.steering == plain.steering);
         assert_eq!(slower.cut_throttle(), Command { throttle: 0.0, ..command });

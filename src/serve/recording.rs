@@ -148,9 +148,10 @@ fn write(images: &Path, log: &Path, mut file: BufWriter<File>, rows: &Receiver<R
         let path = images.join(&name);
         fs::write(&path, &row.image).map_err(Error::io(&path))?;
         let Command { steering, throttle } = row.command;
-        let numbers =
-            [steering, throttle.max(0.0), (-throttle).max(0.0), row.speed_mph].map(|v| (v as f32).to_string());
-        writeln!(file, "IMG/{name}, , , {}", numbers.join(", ")).and_then(|()| file.flush()).map_err(Error::io(log))?;
+        let (accelerator, brake, speed) = (throttle.max(0.0), (-throttle).max(0.0), row.speed_mph as f32);
+        writeln!(file, "IMG/{name}, , , {steering}, {accelerator}, {brake}, {speed}")
+            .and_then(|()| file.flush())
+            .map_err(Error::io(log))?;
         written += 1;
     }
     Ok(written)
@@ -201,7 +202,7 @@ mod tests {
         let recorder = Recorder::start(&folder).unwrap();
         let image = image();
         for frame in 0..20 {
-            let command = Command { steering: f64::from(frame) / 20.0 - 0.5, throttle: f64::from(frame) / 10.0 - 1.0 };
+            let command = Command { steering: frame as f32 / 20.0 - 0.5, throttle: frame as f32 / 10.0 - 1.0 };
             let queued = recorder.push(Clock::Simulated(f64::from(frame) * 0.06), &image, command, 12.5);
             assert_eq!(queued, Queued::Yes);
         }

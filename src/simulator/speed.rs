@@ -7,6 +7,10 @@ use super::simulation::Simulation;
 const PROPORTIONAL: f64 = 0.1;
 /// Throttle for each mph of error and second; `drive.py` adds 0.002 a frame, which is this at 20 frames a second.
 const INTEGRAL_PER_S: f64 = 0.04;
+/// Time that the first frame stands for, s.
+const FIRST_FRAME_S: f64 = 0.05;
+/// Longest time that a frame stands for, s.
+const LONGEST_FRAME_S: f64 = 0.5;
 /// Sideways acceleration that `Speed::Auto` allows itself in bends, m/s².
 const COMFORT_MPS2: f64 = 2.5;
 
@@ -58,9 +62,9 @@ pub fn slower_in_bends_mph(target_mph: f64, steering: f64) -> f64 {
     comfortable_mph(curvature).clamp(SLOWEST_MPH.min(target_mph), target_mph)
 }
 
-/// A number as the telemetry of Udacity's simulator carries it: rounded to four decimals.
-pub fn as_telemetry(value: f64) -> f64 {
-    (value * 1e4).round() / 1e4
+/// The speed as telemetry carries it: four decimals, mph.
+pub fn telemetry_mph(speed_mps: f64) -> f64 {
+    (speed_mps / MPS_PER_MPH * 1e4).round() / 1e4
 }
 
 /// A proportional-integral controller from speed to throttle.
@@ -68,9 +72,21 @@ pub fn as_telemetry(value: f64) -> f64 {
 pub struct SpeedController {
     /// Sum of error times time, mph s.
     integral: f64,
+    /// Time of the last frame, s.
+    last_s: Option<f64>,
 }
 
 impl SpeedController {
+    /// The throttle, [-1, 1], for the frame of time `time_s`, in the 32 bits that the car takes.
+    ///
+    /// The first frame counts for 0.05 s; a gap longer than 0.5 s for no more than that, and a
+    /// clock that ran backwards for nothing.
+    pub fn throttle_at(&mut self, time_s: f64, target_mph: f64, speed_mph: f64) -> f32 {
+        let dt_s = self.last_s.map_or(FIRST_FRAME_S, |last| (time_s - last).clamp(0.0, LONGEST_FRAME_S));
+        self.last_s = Some(time_s);
+        self.throttle(target_mph, speed_mph, dt_s) as f32
+    }
+
     /// The throttle, [-1, 1], after `dt_s` more seconds at `speed_mph` where `target_mph` is wanted.
     pub fn throttle(&mut self, target_mph: f64, speed_mph: f64, dt_s: f64) -> f64 {
         let error = target_mph - speed_mph;
@@ -100,15 +116,6 @@ mod tests {
     }
 
     #[test]
-    fn a_rounded_speed_survives_being_printed() {
-        for value in [0.0, 0.438, 12.345_649_999, 1.0 / 3.0, 29.999_95] {
-            let rounded = as_telemetry(value);
-            assert!((rounded - value).abs() <= 0.5001e-4);
-            assert_eq!(format!("{rounded:.4}").parse::<f64>().unwrap().to_bits(), rounded.to_bits());
-        }
-    }
-
-    #[test]
     fn a_long_start_at_full_throttle_does_not_make_the_car_overshoot() {
         let mut car = Car::new(0.0, 0.0, 1.0, 0.0, 0.0);
         let (mut controller, mut fastest_mph) = (SpeedController::default(), 0.0_f64);
@@ -117,7 +124,8 @@ mod tests {
         }
         for _ in 0..1000 {
             let speed_mph = car.speed_mps / MPS_PER_MPH;
-            car.step(Controls { steering: 0.0, throttle: controller.throttle(20.0, speed_mph, STEP_S) }, 0.0, 0.0);
+            let throttle = controller.throttle(20.0, speed_mph, STEP_S);
+            car.step(Controls { steering: 0.0, throttle }, 0.0, 0.0);
             fastest_mph = fastest_mph.max(speed_mph);
         }
         assert!(fastest_mph < 22.0, "{fastest_mph}");
@@ -135,6 +143,27 @@ mod tests {
                 car.step(Controls { steering: 0.0, throttle }, 0.0, 0.0);
             }
             assert!((car.speed_mps / MPS_PER_MPH - 20.0).abs() < 0.3, "{}", car.speed_mps / MPS_PER_MPH);
+        }
+    }
+
+    #[test]
+    fn time_stamps_count_as_elapsed_time_but_gaps_and_steps_back_are_limited() {
+        let throttle = |times: &[f64]| {
+            let mut controller = SpeedController::default();
+            times.iter().fold(0.0, |_, time_s| controller.throttle_at(*time_s, 20.0, 18.0))
+        };
+        let elapsed = |total_s: f64| SpeedController::default().throttle(20.0, 18.0, total_s) as f32;
+        assert!((throttle(&[7.0, 7.03, 7.1]) - elapsed(0.05 + 0.1)).abs() < 1e-6);
+        assert!((throttle(&[7.0, 90.0]) - elapsed(0.05 + 0.5)).abs() < 1e-6);
+        assert!((throttle(&[7.0, 3.0]) - elapsed(0.05)).abs() < 1e-6);
+    }
+
+    #[test]
+    fn telemetry_has_four_decimals_and_survives_printing() {
+        for mph in [0.0, 0.00004, 0.00005, 12.34565, 29.99999] {
+            let rounded = telemetry_mph(mph * MPS_PER_MPH);
+            assert!((rounded - mph).abs() <= 0.5001e-4);
+            assert_eq!(format!("{rounded:.4}").parse(), Ok(rounded));
         }
     }
 }
