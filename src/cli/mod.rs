@@ -11,7 +11,9 @@ mod inspect;
 mod predict;
 mod progress;
 mod record;
+mod serve;
 mod share_bar;
+mod sim;
 mod summary;
 mod train;
 
@@ -40,6 +42,8 @@ enum Command {
     Train(train::TrainArgs),
     Record(record::RecordArgs),
     Drive(drive::DriveArgs),
+    Serve(serve::ServeArgs),
+    Sim(sim::SimArgs),
     Evaluate(evaluate::EvaluateArgs),
     Experiment(experiment::ExperimentArgs),
     Predict(predict::PredictArgs),
@@ -55,6 +59,8 @@ pub fn main() -> ExitCode {
         Command::Train(args) => train::run(args),
         Command::Record(args) => record::run(args),
         Command::Drive(args) => drive::run(args),
+        Command::Serve(args) => serve::run(args),
+        Command::Sim(args) => sim::run(args),
         Command::Evaluate(args) => evaluate::run(args),
         Command::Experiment(args) => experiment::run(args),
         Command::Predict(args) => predict::run(args),

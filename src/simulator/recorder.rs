@@ -11,12 +11,13 @@ use serde::Serialize;
 use super::camera::{BodyPose, Camera, Mount, RgbFrame};
 use super::car::{Controls, MPS_PER_MPH, STEP_S, STEPS_PER_S};
 use super::expert::{Keyboard, Style, pursuit};
+use super::eye::Eye;
 use super::jpeg;
 use super::light::Variant;
 use super::math::Rng;
 use super::noise::SteeringNoise;
 use super::renderer::Renderer;
-use super::run::{DRIVE_HZ, DriveState, Driver, Eye};
+use super::run::{DRIVE_HZ, DriveState, Driver};
 use super::simulation::{Simulation, Start};
 use super::speed::SpeedController;
 use super::track::Track;
@@ -340,7 +341,7 @@ pub fn write_recording(
 }
 
 /// Creates `out` with its parents; refuses one that exists.
-pub(super) fn create_new_folder(out: &Path) -> Result<()> {
+pub(crate) fn create_new_folder(out: &Path) -> Result<()> {
     if let Some(parent) = out.parent().filter(|p| !p.as_os_str().is_empty()) {
         fs::create_dir_all(parent).map_err(Error::io(parent))?;
     }
