@@ -133,7 +133,7 @@ fn a_job_that_was_stopped_goes_on_through_dagger_to_the_drives() {
     // What is there is not overwritten, and that is said before anything is done.
     let mut watcher = Silent;
     let again = Job::new(scope, note, &mut watcher, &Silent, &never).begin(request("stopped"));
-    assert!(again.unwrap_err().to_string().contains("stopped-dagger-1: exists already"));
+    assert!(again.unwrap_err().to_string().contains("stopped is not empty"));
 }
 
 #[test]

@@ -130,14 +130,9 @@ impl<'a> Job<'a> {
     /// As [`training_set::recordings`], [`training::train`] and [`test_on_track`]; [`Error::Interrupted`] after a stop.
     pub fn begin(&mut self, request: JobRequest) -> Result<MainJobResult> {
         let JobRequest { recipe, out, seed, cache_mib } = request;
+        RunFolder::require_free(&out)?;
         for round in 1..=self.note.dagger_rounds {
-            let later = dagger_folder(&out, 0, round)?;
-            if later.exists() {
-                return Err(Error::Usage(format!(
-                    "{}: exists already and is not overwritten; name another folder with --out",
-                    later.display()
-                )));
-            }
+            RunFolder::require_free(&dagger_folder(&out, 0, round)?)?;
         }
         let recordings = training_set(&self.scope.recordings, &self.scope.takes, self.stages, self.stop)?;
         let training = self.train(TrainRequest { recordings, recipe, out, seed, cache_mib })?;
@@ -167,7 +162,6 @@ impl<'a> Job<'a> {
     }
 
     fn train(&mut self, request: TrainRequest) -> Result<TrainResult> {
-        RunFolder::create(&request.out)?;
         self.note.write(&request.out)?;
         let out = request.out.clone();
         let result = training::train(request, self.observer, self.stop);
