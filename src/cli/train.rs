@@ -13,6 +13,7 @@ use crate::error::{Error, Result};
 use crate::main_job::held_out::trained_on_held_out;
 use crate::main_job::{MainJobResult, TRACKS, TrackResult, held_out, test_on_track, training_set};
 use crate::pilot::Pilot;
+use crate::report;
 use crate::simulator::{DriveOptions, Track};
 use crate::training::{self, RunFolder, TrainRequest, TrainResult};
 
@@ -85,6 +86,13 @@ pub fn run(args: TrainArgs) -> Result<()> {
             (out, result)
         }
     };
+    if result.is_ok() {
+        match pool.install(|| report::run::write(&folder)) {
+            Ok(page) => eprintln!("report {}", page.display()),
+            // The run is done and saved; a page that cannot be written takes nothing from it.
+            Err(error) => eprintln!("note: no report.html: {error}"),
+        }
+    }
     match result {
         Ok(training) if whole_job => {
             let last = folder.join("last.safetensors");

@@ -273,17 +273,10 @@ fn colours(page: &mut Page, recording: &Recording, spec: &Preprocessing, count: 
             let Ok(mut preprocessor) = spec.plan(image.height, image.width) else { continue };
             let mut planes = vec![0; spec.output_len()];
             preprocessor.apply(&image.pixels, &mut planes);
-            let source = if colour == Colour::Rgb {
-                RgbImage::from_fn(height, width, |r, c| {
-                    std::array::from_fn(|k| planes[k * height * width + r * width + c])
-                })
-            } else {
-                side_by_side(&planes, height, width)
-            };
-            let names = if colour == Colour::Rgb { "in colour".to_string() } else { colour.plane_names().join(" | ") };
+            let source = sheet(&planes, height, width);
             figures.push(Figure {
                 source: source.png_address(),
-                caption: format!("{}{own}: {names}", colour.name()),
+                caption: format!("{}{own}: {}", colour.name(), colour.plane_names().join(", ")),
                 pixelated: true,
             });
         }
@@ -300,13 +293,15 @@ fn kept_rows(image: &RgbImage, spec: &Preprocessing) -> RgbImage {
     })
 }
 
-/// Planes as grey pictures beside each other.
-fn side_by_side(planes: &[u8], height: usize, width: usize) -> RgbImage {
+/// Up to three planes as grey pictures, beside each other, or wide ones below each other; always with room for three.
+fn sheet(planes: &[u8], height: usize, width: usize) -> RgbImage {
     const GAP: usize = 2;
-    let count = planes.len() / (height * width);
-    let mut sheet = RgbImage::filled(height, count * (width + GAP) - GAP, [255; 3]);
+    let below = 2 * width > 3 * height;
+    let [down, across] = if below { [3, 1] } else { [1, 3] };
+    let mut sheet = RgbImage::filled(down * (height + GAP) - GAP, across * (width + GAP) - GAP, [255; 3]);
     for (i, plane) in planes.chunks_exact(height * width).enumerate() {
-        sheet.paste(&RgbImage::grey(height, width, plane), 0, i * (width + GAP));
+        let (top, left) = if below { (i * (height + GAP), 0) } else { (0, i * (width + GAP)) };
+        sheet.paste(&RgbImage::grey(height, width, plane), top, left);
     }
     sheet
 }

@@ -7,6 +7,12 @@ use image::{ExtendedColorType, ImageEncoder};
 use crate::dataset::decode::{RgbImage, decode_rgb};
 use crate::dataset::{Camera, Recording};
 
+/// Colour of what a person steers, [`palette::BLUE`](super::palette::BLUE).
+pub const HUMAN: [u8; 3] = [0x00, 0x72, 0xb2];
+/// Colour of what a model steers: [`palette::ORANGE`](super::palette::ORANGE), lighter.
+pub const MODEL: [u8; 3] = [0xff, 0xb0, 0x00];
+/// Steering lines are drawn at this many times the angle of the wheels.
+pub const STEERING_SCALE: f64 = 2.0;
 /// Quality of JPEGs in pages: a camera frame takes about 8 kB.
 const QUALITY: u8 = 78;
 
@@ -56,6 +62,42 @@ impl RgbImage {
                 self.set_pixel(top + row, left + column, other.pixel(row, column));
             }
         }
+    }
+
+    /// Draws a line of `thickness` pixels between two points (x, y); what lies outside is cut off.
+    pub fn draw_line(&mut self, from: [f64; 2], to: [f64; 2], thickness: f64, rgb: [u8; 3]) {
+        let [dx, dy] = [to[0] - from[0], to[1] - from[1]];
+        let length = dx.hypot(dy).max(1e-9);
+        let half = thickness / 2.0;
+        let range = |a: f64, b: f64, end: usize| {
+            let low = (a.min(b) - half).floor().clamp(0.0, end as f64) as usize;
+            low..((a.max(b) + half).ceil() + 1.0).clamp(0.0, end as f64) as usize
+        };
+        for row in range(from[1], to[1], self.height) {
+            for column in range(from[0], to[0], self.width) {
+                let (x, y) = (column as f64 - from[0], row as f64 - from[1]);
+                let along = ((x * dx + y * dy) / length).clamp(0.0, length);
+                let apart = (x - along * dx / length).hypot(y - along * dy / length);
+                // Half a pixel of transition, so that the edge is smooth.
+                let cover = (half + 0.5 - apart).clamp(0.0, 1.0);
+                if cover > 0.0 {
+                    let below = self.pixel(row, column);
+                    let mixed = |k: usize| f64::from(below[k]) + (f64::from(rgb[k]) - f64::from(below[k])) * cover;
+                    self.set_pixel(row, column, std::array::from_fn(|k| mixed(k).round() as u8));
+                }
+            }
+        }
+    }
+
+    /// Draws a steering angle as a line from the middle of the lower edge, outlined so that it shows on any ground.
+    pub fn draw_steering(&mut self, wheels_deg: f64, rgb: [u8; 3]) {
+        let (height, width) = (self.height as f64, self.width as f64);
+        let (sin, cos) = (STEERING_SCALE * wheels_deg).clamp(-85.0, 85.0).to_radians().sin_cos();
+        let from = [width / 2.0, height * 0.98];
+        let to = [from[0] + 0.45 * height * sin, from[1] - 0.45 * height * cos];
+        let thickness = (height / 50.0).max(1.5);
+        self.draw_line(from, to, thickness + 2.0, [255; 3]);
+        self.draw_line(from, to, thickness, rgb);
     }
 
     /// As JPEG. An empty picture has no bytes.
@@ -114,6 +156,18 @@ mod tests {
         let mut sheet = RgbImage::filled(3, 3, [255; 3]);
         sheet.paste(&picture, 1, 1);
         assert_eq!((sheet.pixel(0, 0), sheet.pixel(1, 1), sheet.pixel(2, 2)), ([255; 3], [0, 0, 7], [1, 1, 7]));
+    }
+
+    #[test]
+    fn lines_cover_what_lies_on_them_and_stay_inside() {
+        let mut picture = RgbImage::filled(20, 20, [0; 3]);
+        picture.draw_line([-30.0, 10.0], [50.0, 10.0], 3.0, [200; 3]);
+        assert!((0..20).all(|x| picture.pixel(10, x) == [200; 3] && picture.pixel(13, x) == [0; 3]));
+        let mut picture = RgbImage::filled(100, 200, [0; 3]);
+        picture.draw_steering(22.5, HUMAN);
+        // Twice 22.5 degrees: as far to the right as up.
+        assert_eq!(picture.pixel(98 - 20, 100 + 20), HUMAN);
+        assert_eq!(picture.pixel(98 - 20, 100 - 20), [0; 3]);
     }
 
     #[test]
