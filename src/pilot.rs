@@ -80,6 +80,16 @@ impl Pilot {
         &self.model.recipe
     }
 
+    /// The network that steers.
+    pub fn network(&self) -> &Network {
+        &self.model.network
+    }
+
+    /// The numbers of the network.
+    pub fn parameters(&self) -> &Parameters {
+        &self.model.parameters
+    }
+
     /// Steering for an RGB image, `[height][width][3]`. Roughly in [−1, 1], positive to the right; not clamped.
     ///
     /// # Errors

@@ -18,6 +18,7 @@ mod summary;
 mod train;
 
 use std::io::{ErrorKind, Write};
+use std::path::Path;
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -112,6 +113,20 @@ fn stop_on_ctrl_c() -> Result<Arc<AtomicBool>> {
     };
     ctrlc::set_handler(handler).map_err(|e| Error::Usage(format!("cannot listen for Ctrl-C: {e}")))?;
     Ok(stop)
+}
+
+/// Refuses an output that exists already.
+fn refuse_existing(path: &Path) -> Result<()> {
+    match path.exists() {
+        true => Err(Error::Usage(format!("{}: exists already and is not overwritten; name a new one", path.display()))),
+        false => Ok(()),
+    }
+}
+
+/// Makes the new folder `path`, and those it lies in.
+fn new_folder(path: &Path) -> Result<()> {
+    refuse_existing(path)?;
+    std::fs::create_dir_all(path).map_err(Error::io(path))
 }
 
 /// Prints `text`. Whoever reads may stop before the end, as `head` does.
