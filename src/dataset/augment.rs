@@ -1,7 +1,7 @@
-//! Random changes to training images: a horizontal shift, a shadow, lines, colours, brightness. Validation and driving never see
+//! Random changes to training images: a horizontal shift, shadows, lines, colours, brightness. Validation and driving never see
 //! them.
 //!
-//! They act on the RGB stage of preprocessing (cropped, before the colour conversion), in this order: shift, shadow,
+//! They act on the RGB stage of preprocessing (cropped, before the colour conversion), in this order: shift, shadows,
 //! lines, colours, brightness. Each is drawn anew for every sample and epoch.
 
 use super::preprocess::Preprocessing;
@@ -19,7 +19,9 @@ pub struct Augmentation {
     pub brightness: Option<[f64; 2]>,
     /// Probability of a shadow: one side of a random line from the top to the bottom edge is darkened.
     pub shadow_probability: f64,
-    /// Range of the factor that grey levels in the shadow are multiplied by; smaller is darker.
+    /// Probability of a shadow that falls across: a band between the left and the right edge, as of a tree or a post.
+    pub band_probability: f64,
+    /// Range of the factor that grey levels in a shadow are multiplied by; smaller is darker.
     pub shadow_strength: [f64; 2],
     /// Largest number of straight lines across the picture that are darkened or lightened: seams, wires, wheel tracks, of which
     /// none is the edge of the road.
@@ -50,6 +52,7 @@ impl Default for Augmentation {
         Self {
             brightness: None,
             shadow_probability: 0.0,
+            band_probability: 0.0,
             shadow_strength: [0.2, 0.5],
             lines: 0,
             line_strength: [0.4, 1.6],
@@ -67,6 +70,7 @@ impl Augmentation {
     /// Whether anything is changed at all.
     pub fn is_active(&self) -> bool {
         self.brightness.is_some()
+            || self.band_probability > 0.0
             || self.shadow_probability > 0.0
             || self.shift_px > 0.0
             || self.lines > 0
@@ -104,6 +108,9 @@ impl Augmentation {
         if !(0.0..=1.0).contains(&self.shadow_probability) {
             return wrong("shadow_probability", "must be 0 to 1");
         }
+        if !(0.0..=1.0).contains(&self.band_probability) {
+            return wrong("band_probability", "must be 0 to 1");
+        }
         if !(0.0..=1000.0).contains(&self.shift_px) {
             return wrong("shift_px", "must be 0 to 1000 source pixels");
         }
@@ -130,6 +137,16 @@ impl Augmentation {
             let factor = uniform(rng, self.shadow_strength[0], self.shadow_strength[1]);
             if chance < self.shadow_probability {
                 shadow(rgb, width, top, bottom, side < 0.5, &factors(factor));
+            }
+        }
+        if self.band_probability > 0.0 {
+            let [chance, from, length, height, thickness] = [(); 5].map(|()| unit(rng));
+            let tilt = uniform(rng, -0.5, 0.5);
+            let factor = uniform(rng, self.shadow_strength[0], self.shadow_strength[1]);
+            if chance < self.band_probability {
+                let band =
+                    Band { from: from - 0.3, length: 0.3 + length, height, tilt, thickness: 0.02 + 0.23 * thickness };
+                band.darken(rgb, width, &factors(factor));
             }
         }
         for _ in 0..below(rng, self.lines as usize + 1) {
@@ -189,6 +206,35 @@ fn shadow(rgb: &mut [u8], width: usize, top: f64, bottom: f64, left: bool, table
         let (before, after) = row.split_at_mut(edge);
         let dark = if left { before } else { after };
         dark.iter_mut().for_each(|grey| *grey = table[usize::from(*grey)]);
+    }
+}
+
+/// A band across the picture, in shares of its width and height.
+struct Band {
+    /// Where it begins, from the left edge.
+    from: f64,
+    /// How far it reaches to the right.
+    length: f64,
+    /// Its middle at the left edge, from the top.
+    height: f64,
+    /// How much lower its middle is at the right edge.
+    tilt: f64,
+    /// From its upper to its lower rim.
+    thickness: f64,
+}
+
+impl Band {
+    fn darken(&self, rgb: &mut [u8], width: usize, table: &[u8; 256]) {
+        let rows = rgb.len() / (width * 3);
+        let column_at = |share: f64| ((share * width as f64).round().max(0.0) as usize).min(width);
+        for x in column_at(self.from)..column_at(self.from + self.length) {
+            let middle = self.height + self.tilt * (x as f64 + 0.5) / width as f64;
+            let row_at = |share: f64| ((share * rows as f64).round().max(0.0) as usize).min(rows);
+            for y in row_at(middle - 0.5 * self.thickness)..row_at(middle + 0.5 * self.thickness) {
+                let at = (y * width + x) * 3;
+                rgb[at..at + 3].iter_mut().for_each(|grey| *grey = table[usize::from(*grey)]);
+            }
+        }
     }
 }
 
@@ -286,6 +332,26 @@ mod tests {
         }
         // A line near the border can leave the picture as it is, so a few less than 500.
         assert!((400..=560).contains(&shadows), "{shadows}");
+    }
+
+    #[test]
+    fn bands_darken_what_lies_between_their_rims() {
+        let mut rgb = vec![100; 4 * 10 * 3];
+        let band = Band { from: 0.3, length: 0.5, height: 0.25, tilt: 0.5, thickness: 0.5 };
+        band.darken(&mut rgb, 10, &factors(0.5));
+        let dark = |y: usize| (0..10).filter(|x| rgb[(y * 10 + x) * 3] == 50).collect::<Vec<_>>();
+        // Columns 3 to 7; two of four rows, lower to the right: the middle is at 0.25 + 0.05 (x + 0.5).
+        assert_eq!([dark(0), dark(1), dark(2), dark(3)], [vec![], vec![3, 4, 5, 6], vec![3, 4, 5, 6, 7], vec![7]]);
+        let bands = Augmentation { band_probability: 0.5, shadow_strength: [0.5, 0.5], ..Default::default() };
+        assert!(bands.is_active() && bands.validate().is_ok());
+        let mut seen = 0;
+        for stream in 0..1000 {
+            let mut rgb = vec![100; 4 * 10 * 3];
+            assert_eq!(bands.apply(&preprocessing(), &mut rgb, &mut rng(4, Purpose::Test, 0, stream)), 0.0);
+            seen += usize::from(rgb.contains(&50));
+        }
+        // Thin bands and those beside the picture may touch no pixel.
+        assert!((250..=520).contains(&seen), "{seen}");
     }
 
     #[test]
