@@ -165,8 +165,10 @@ impl<'a> Job<'a> {
         self.note.write(&request.out)?;
         let out = request.out.clone();
         let result = training::train(request, self.observer, self.stop);
-        // Before `run.json` is there, nothing can be resumed.
-        self.folder = RunFolder::open(&out).is_ok().then_some(out);
+        // Before `run.json` is there this run cannot be resumed, but the one before it can.
+        if RunFolder::open(&out).is_ok() {
+            self.folder = Some(out);
+        }
         result
     }
 
