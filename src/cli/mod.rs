@@ -6,6 +6,7 @@
 mod bench;
 mod drive;
 mod evaluate;
+mod experiment;
 mod inspect;
 mod predict;
 mod progress;
@@ -40,6 +41,7 @@ enum Command {
     Record(record::RecordArgs),
     Drive(drive::DriveArgs),
     Evaluate(evaluate::EvaluateArgs),
+    Experiment(experiment::ExperimentArgs),
     Predict(predict::PredictArgs),
     Inspect(inspect::InspectArgs),
     Summary(summary::SummaryArgs),
@@ -54,6 +56,7 @@ pub fn main() -> ExitCode {
         Command::Record(args) => record::run(args),
         Command::Drive(args) => drive::run(args),
         Command::Evaluate(args) => evaluate::run(args),
+        Command::Experiment(args) => experiment::run(args),
         Command::Predict(args) => predict::run(args),
         Command::Inspect(args) => inspect::run(args),
         Command::Summary(args) => summary::run(args),

@@ -246,7 +246,7 @@ pub fn run(track: &Track, driver: &mut dyn Driver, options: &RunOptions, seed: u
 }
 
 /// Takes the driver's pictures.
-struct Eye<'a> {
+pub(super) struct Eye<'a> {
     track: &'a Track,
     variant: Variant,
     renderer: Renderer,
@@ -255,7 +255,7 @@ struct Eye<'a> {
 }
 
 impl<'a> Eye<'a> {
-    fn new(track: &'a Track, seed: u64) -> Eye<'a> {
+    pub(super) fn new(track: &'a Track, seed: u64) -> Eye<'a> {
         Eye {
             track,
             variant: Variant::new(track.world(), seed),
@@ -265,7 +265,7 @@ impl<'a> Eye<'a> {
         }
     }
 
-    fn look(&mut self, simulation: &Simulation) -> Result<&RgbFrame> {
+    pub(super) fn look(&mut self, simulation: &Simulation) -> Result<&RgbFrame> {
         let camera = Camera::new(&simulation.body_pose(), Mount::Center);
         self.renderer.render(self.track.world(), &self.variant, &camera, Mount::Center, &mut self.frame);
         self.jpeg.apply(&mut self.frame)?;

@@ -22,6 +22,6 @@ pub use crate::loss::Loss;
 pub use checkpoint::{Progress, State};
 pub use data::Data;
 pub use history::{EpochRecord, write_history};
-pub use run_folder::RunFolder;
+pub use run_folder::{RunFolder, RunInfo};
 pub use session::{Observer, TrainRequest, TrainResult, resume, train};
 pub use validation::{Validation, ValidationResult};
