@@ -13,6 +13,7 @@ mod progress;
 mod record;
 mod share_bar;
 mod summary;
+mod tracks;
 mod train;
 
 use std::io::{ErrorKind, Write};
@@ -44,6 +45,7 @@ enum Command {
     Experiment(experiment::ExperimentArgs),
     Predict(predict::PredictArgs),
     Inspect(inspect::InspectArgs),
+    Tracks(tracks::TracksArgs),
     Summary(summary::SummaryArgs),
     Bench(bench::BenchArgs),
 }
@@ -59,6 +61,7 @@ pub fn main() -> ExitCode {
         Command::Experiment(args) => experiment::run(args),
         Command::Predict(args) => predict::run(args),
         Command::Inspect(args) => inspect::run(args),
+        Command::Tracks(args) => tracks::run(args),
         Command::Summary(args) => summary::run(args),
         Command::Bench(args) => bench::run(args, started),
     };

@@ -440,11 +440,7 @@ impl View<'_> {
     #[inline(always)]
     fn tone(&self, red_blue: u32, green: u32, out: &mut [u8; 3]) {
         let [red, middle, blue] = &self.variant.tone;
-        *out = [
-            red[(red_blue & 255) as usize],
-            middle[(green & 255) as usize],
-            blue[(red_blue >> 16 & 255) as usize],
-        ];
+        *out = [red[(red_blue & 255) as usize], middle[(green & 255) as usize], blue[(red_blue >> 16 & 255) as usize]];
     }
 
     #[inline(never)]
@@ -483,7 +479,8 @@ impl View<'_> {
         for (i, ((out, depth), below)) in out.iter_mut().zip(depths).zip(below).enumerate() {
             let ray = self.ray(k, row) + self.camera.right * (i as f32 / FOCAL_PX);
             // Above the sky is only sky.
-            let hit = if *below == 0.0 { None } else { self.march(ray, 1.0 / below, ray.z - self.camera.up.z / FOCAL_PX) };
+            let hit =
+                if *below == 0.0 { None } else { self.march(ray, 1.0 / below, ray.z - self.camera.up.z / FOCAL_PX) };
             let Some(hit) = hit else {
                 *depth = 0.0;
                 let turn = self.columns[k].turn - i as f32 * AROUND as f32 / 900.0;

@@ -137,7 +137,10 @@ fn extent(texels: &[u32]) -> (Range<i32>, Range<i32>) {
     let first = most.iter().position(|a| *a > 0).unwrap_or(SIZE / 2);
     let last = most.iter().rposition(|a| *a > 0).map_or(SIZE / 2, |v| v + 1);
     let fixed = |v: usize| (v << ACROSS_BITS) as i32;
-    (fixed(left + ROOM)..fixed(right.saturating_sub(ROOM)), fixed(first.saturating_sub(ROOM))..fixed((last + ROOM).min(SIZE)))
+    (
+        fixed(left + ROOM)..fixed(right.saturating_sub(ROOM)),
+        fixed(first.saturating_sub(ROOM))..fixed((last + ROOM).min(SIZE)),
+    )
 }
 
 /// Logarithm to base 2, rounded down and kept within the levels, from the exponent bits of the number.
