@@ -26,15 +26,7 @@ impl NewFolder {
         if fs::symlink_metadata(path).is_ok() {
             return Err(exists(path));
         }
-        let parent = match path.parent() {
-            Some(parent) if !parent.as_os_str().is_empty() => parent,
-            _ => Path::new("."),
-        };
-        let denied = |source: io::Error| {
-            let message = format!("cannot be created: {source}; name a folder where you may write");
-            Error::Usage(format!("{}: {message}", path.display()))
-        };
-        fs::create_dir_all(parent).map_err(denied)?;
+        let parent = create_parent(path)?;
         let name = path.file_name().unwrap_or_default().to_string_lossy();
         let prefix = format!(".{name}-unfinished-");
         let mut builder = tempfile::Builder::new();
@@ -42,7 +34,7 @@ impl NewFolder {
         // Temporary folders are for their owner alone; this one is as readable as any other folder.
         #[cfg(unix)]
         builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o777));
-        let unfinished = builder.tempdir_in(parent).map_err(denied)?;
+        let unfinished = builder.tempdir_in(parent).map_err(|source| denied(path, &source))?;
         Ok(NewFolder { path: path.to_path_buf(), unfinished })
     }
 
@@ -80,6 +72,34 @@ impl NewFolder {
         }
         Error::Io { path, source }
     }
+}
+
+/// Creates the folder `path` at once, for what is to be seen while it grows; missing parents are created.
+///
+/// # Errors
+///
+/// As [`NewFolder::create`].
+pub fn create_now(path: &Path) -> Result<()> {
+    create_parent(path)?;
+    fs::create_dir(path).map_err(|source| match source.kind() {
+        ErrorKind::AlreadyExists => exists(path),
+        _ => denied(path, &source),
+    })
+}
+
+/// Creates what is missing above `path` and returns the folder it will be in.
+fn create_parent(path: &Path) -> Result<&Path> {
+    let parent = match path.parent() {
+        Some(parent) if !parent.as_os_str().is_empty() => parent,
+        _ => Path::new("."),
+    };
+    fs::create_dir_all(parent).map_err(|source| denied(path, &source))?;
+    Ok(parent)
+}
+
+fn denied(path: &Path, source: &io::Error) -> Error {
+    let message = format!("cannot be created: {source}; name a folder where you may write");
+    Error::Usage(format!("{}: {message}", path.display()))
 }
 
 fn exists(path: &Path) -> Error {

@@ -33,6 +33,14 @@ impl ShareBar {
         ShareBar { what, bar, last_line: Mutex::new(Instant::now()) }
     }
 
+    /// Prints a line above the bar.
+    pub fn print(&self, text: &str) {
+        match &self.bar {
+            Some(bar) => bar.suspend(|| eprintln!("{text}")),
+            None => eprintln!("{text}"),
+        }
+    }
+
     /// Shows that `share`, 0 to 1, is done.
     pub fn set(&self, share: f64) {
         match &self.bar {

@@ -12,6 +12,7 @@ use crate::error::{Error, Result};
 use crate::main_job::held_out::trained_on_held_out;
 use crate::main_job::job::{Job, JobNote, JobRequest};
 use crate::main_job::{MainJobResult, TrackResult, held_out};
+use crate::report;
 use crate::training::{self, RunFolder, TrainRequest, TrainResult};
 
 /// Train a network on recordings
@@ -80,6 +81,9 @@ pub fn run(args: TrainArgs) -> Result<()> {
             }
         };
         let result = explain_stop(result, job.folder())?;
+        if let Some(folder) = job.folder() {
+            pool.install(|| write_report(folder));
+        }
         if args.json {
             return print_json(&result);
         }
@@ -116,11 +120,20 @@ pub fn run(args: TrainArgs) -> Result<()> {
         }
     };
     let result = explain_stop(result, Some(&folder))?;
+    pool.install(|| write_report(&folder));
     if args.json {
         return print_json(&result);
     }
     print_training(&result);
     Ok(())
+}
+
+/// Writes the page of the finished run in `folder`. The run is saved; a page that cannot be written takes nothing from it.
+fn write_report(folder: &Path) {
+    match report::run::write(folder) {
+        Ok(page) => eprintln!("report {}", page.display()),
+        Err(error) => eprintln!("note: no report.html: {error}"),
+    }
 }
 
 /// Says after a stop how to go on: with the run in `folder`, if there is one.

@@ -5,6 +5,8 @@ use std::path::{Path, PathBuf};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
+use super::history::{EpochRecord, read_history};
+use super::session::TrainResult;
 use crate::atomic_file;
 use crate::error::{Error, Result};
 use crate::recipe::Recipe;
@@ -92,22 +94,6 @@ impl RunFolder {
         self.file("model.safetensors")
     }
 
-    pub(super) fn write_json(&self, name: &str, value: &impl Serialize) -> Result<()> {
-        let path = self.file(name);
-        let text = serde_json::to_string_pretty(value).map_err(|e| Error::data(&path, e.to_string()))?;
-        atomic_file::write(&path, (text + "\n").as_bytes())
-    }
-
-    pub(super) fn read_json<T: DeserializeOwned>(&self, name: &str) -> Result<T> {
-        let path = self.file(name);
-        let text = std::fs::read_to_string(&path).map_err(Error::io(&path))?;
-        serde_json::from_str(&text).map_err(|e| Error::data_at(&path, e.line() as u64, e.to_string()))
-    }
-
-    pub(super) fn write_recipe(&self, recipe: &Recipe) -> Result<()> {
-        atomic_file::write(&self.file("recipe.toml"), recipe.to_toml()?.as_bytes())
-    }
-
     /// The recipe of the run.
     ///
     /// # Errors
@@ -115,6 +101,40 @@ impl RunFolder {
     /// As [`Recipe::find`].
     pub fn recipe(&self) -> Result<Recipe> {
         Recipe::find(&self.file("recipe.toml").display().to_string(), &[])
+    }
+
+    /// The epochs that are done.
+    ///
+    /// # Errors
+    ///
+    /// As [`read_history`].
+    pub fn history(&self) -> Result<Vec<EpochRecord>> {
+        read_history(&self.file("history.csv"))
+    }
+
+    /// What the run came to; `None` while it is not finished.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Io`] and [`Error::Data`].
+    pub fn result(&self) -> Result<Option<TrainResult>> {
+        if self.file("result.json").is_file() { self.read_json("result.json").map(Some) } else { Ok(None) }
+    }
+
+    pub(super) fn write_json(&self, name: &str, value: &impl Serialize) -> Result<()> {
+        let path = self.file(name);
+        let text = serde_json::to_string_pretty(value).map_err(|e| Error::data(&path, e.to_string()))?;
+        atomic_file::write(&path, (text + "\n").as_bytes())
+    }
+
+    fn read_json<T: DeserializeOwned>(&self, name: &str) -> Result<T> {
+        let path = self.file(name);
+        let text = std::fs::read_to_string(&path).map_err(Error::io(&path))?;
+        serde_json::from_str(&text).map_err(|e| Error::data_at(&path, e.line() as u64, e.to_string()))
+    }
+
+    pub(super) fn write_recipe(&self, recipe: &Recipe) -> Result<()> {
+        atomic_file::write(&self.file("recipe.toml"), recipe.to_toml()?.as_bytes())
     }
 }
 

@@ -41,8 +41,8 @@ pub struct TrainRequest {
 pub trait Observer {
     /// Something the user should know.
     fn notice(&mut self, text: &str);
-    /// Images of epoch `epoch` (from 1) that are done, of how many.
-    fn progress(&mut self, epoch: u32, images: usize, of: usize);
+    /// Images of epoch `epoch` (from 1) that are done, of how many, and the mean loss of the last batch.
+    fn progress(&mut self, epoch: u32, images: usize, of: usize, loss: f64);
     /// An epoch is done, of how many.
     fn epoch(&mut self, record: &EpochRecord, of: u32);
 }
@@ -115,9 +115,8 @@ pub fn train(request: TrainRequest, observer: &mut dyn Observer, stop: &AtomicBo
 pub fn resume(path: &Path, observer: &mut dyn Observer, stop: &AtomicBool) -> Result<TrainResult> {
     let started = Instant::now();
     let folder = RunFolder::open(path)?;
-    if folder.file("result.json").is_file() {
+    if let Some(result) = folder.result()? {
         observer.notice("this run is finished; here is its result again");
-        let result: TrainResult = folder.read_json("result.json")?;
         return Ok(TrainResult { model: folder.model(), ..result });
     }
     let info = folder.info()?;
@@ -273,7 +272,7 @@ impl Session {
             progress.images += current.n;
             progress.next_batch = following;
             progress.train_seconds = seconds_of_epoch_before + started.elapsed().as_secs_f64();
-            observer.progress(epoch + 1, progress.images, training.samples());
+            observer.progress(epoch + 1, progress.images, training.samples(), mean_loss);
             std::mem::swap(current, next);
             if stop.load(Ordering::Relaxed) {
                 self.state.progress.seconds = seconds_before + self.started.elapsed().as_secs_f64();
