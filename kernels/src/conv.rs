@@ -5,12 +5,16 @@
 //! | forward | a sum over taps with vectors along the output rows (`direct`), of the image itself when the stride is 1 and nothing is padded, else of a copy that is padded and split into phases (`prepare`) |
 //! | input gradient | for each phase of the input the same sum over the zero-padded output gradient, with the kernel turned round (`input_gradient`); where that would mostly multiply zeros, a matrix product and [`crate::im2col::col2im`] |
 //! | weight gradient | vectors along the output rows, summed over lanes at the end (`weight_gradient`) |
+//! | both gradients, behind 4x4 pooling | one position at a time (`sparse`) |
+//!
+//! Within a pass the sizes of tiles and blocks follow from the shape and the instruction set: see `direct`.
 
 mod direct;
 mod grid;
 mod input_gradient;
 mod prepare;
 mod shape;
+mod sparse;
 mod weight_gradient;
 
 use crate::Isa;
@@ -155,6 +159,52 @@ impl Conv {
         if any {
             backward_weight(self.isa, self, x, dy, dweight, dbias, scratch);
         }
+    }
+}
+
+/// Gradients from `count` positions of each output channel, all others being 0.
+///
+/// `starts` tells the positions, `[n][oc][count]`: where the window of the output begins in a plane of the input,
+/// `oy * w + ox`. `dy` are the output gradients there.
+impl Conv {
+    /// Whether the shape has these: strides of 1, no padding, 3x3 or 5x5 kernels.
+    pub fn has_sparse_gradients(&self) -> bool {
+        sparse::supports(&self.shape)
+    }
+
+    /// As [`Conv::backward_weight`].
+    ///
+    /// # Panics
+    /// If a slice has another length, a start lies outside the plane, or the shape has no sparse gradients.
+    pub fn sparse_backward_weight(
+        &self,
+        n: usize,
+        x: &[f32],
+        starts: &[u32],
+        dy: &[f32],
+        dweight: &mut [f32],
+        dbias: &mut [f32],
+    ) {
+        self.check_sparse(n, x.len(), starts.len(), dy.len(), dweight.len());
+        assert_eq!(dbias.len(), self.shape.oc, "sparse conv gradient: length of the bias of {:?}", self.shape);
+        sparse::weight_gradient(self.isa, &self.shape, x, starts, dy, dweight, dbias);
+    }
+
+    /// As [`Conv::backward_input`].
+    ///
+    /// # Panics
+    /// As [`Conv::sparse_backward_weight`].
+    pub fn sparse_backward_input(&self, n: usize, starts: &[u32], dy: &[f32], weight: &[f32], dx: &mut [f32]) {
+        self.check_sparse(n, dx.len(), starts.len(), dy.len(), weight.len());
+        sparse::input_gradient(self.isa, &self.shape, starts, dy, weight, dx);
+    }
+
+    fn check_sparse(&self, n: usize, x_len: usize, starts: usize, dy: usize, weight: usize) {
+        let shape = &self.shape;
+        assert!(self.has_sparse_gradients(), "no sparse gradients of {shape:?}");
+        assert_eq!(x_len, n * shape.x_len(), "sparse conv gradient: length of the {n} inputs of {shape:?}");
+        assert_eq!(weight, shape.oc * shape.taps(), "sparse conv gradient: length of the weights of {shape:?}");
+        assert!(starts == dy && dy.is_multiple_of((n * shape.oc).max(1)), "sparse conv gradient: uneven positions");
     }
 }
 

@@ -62,6 +62,51 @@ per_isa! {
     }
 }
 
+per_isa! {
+    /// As [`max_forward`], and tells in `places`, as long as `y`, where the first maximum of each window lies in its plane:
+    /// row times `pitch` plus column. Only for windows of 4 columns that neither overlap nor leave gaps.
+    pub fn max_forward_with_places<S>(
+        _simd: S,
+        shape: &PoolShape,
+        n: usize,
+        pitch: usize,
+        x: &[f32],
+        y: &mut [f32],
+        places: &mut [u32],
+    ) {
+        shape.check("max_forward_with_places", n, x.len(), y.len());
+        let &PoolShape { h, w, kh, kw, stride_h, stride_w, .. } = shape;
+        assert!((kw, stride_w, stride_h) == (4, 4, kh), "max_forward_with_places: not for windows of {shape:?}");
+        assert_eq!(places.len(), y.len(), "max_forward_with_places: y and places differ in length");
+        if y.is_empty() {
+            return;
+        }
+        let (out_h, out_w) = (shape.out_h(), shape.out_w());
+        let outputs = y.chunks_exact_mut(out_h * out_w).zip(places.chunks_exact_mut(out_h * out_w));
+        for (x, (y, places)) in x.chunks_exact(h * w).zip(outputs) {
+            let rows = y.chunks_exact_mut(out_w).zip(places.chunks_exact_mut(out_w));
+            for (oy, (y, places)) in rows.enumerate() {
+                let first = (oy * kh * pitch) as u32;
+                y.fill(f32::NEG_INFINITY);
+                places.iter_mut().enumerate().for_each(|(i, place)| *place = first + 4 * i as u32);
+                for (ky, row) in x[oy * kh * w..].chunks_exact(w).take(kh).enumerate() {
+                    let first = first + (ky * pitch) as u32;
+                    let windows = y.iter_mut().zip(places.iter_mut()).zip(row.as_chunks::<4>().0);
+                    for (i, ((y, place), block)) in windows.enumerate() {
+                        let (mut most, mut at) = (*y, *place);
+                        for j in 0..4 {
+                            let larger = block[j] > most;
+                            most = if larger { block[j] } else { most };
+                            at = if larger { first + 4 * i as u32 + j as u32 } else { at };
+                        }
+                        (*y, *place) = (most, at);
+                    }
+                }
+            }
+        }
+    }
+}
+
 /// `y[i]` becomes the maximum of itself and block `i` of a row.
 #[inline(always)]
 fn max_of_blocks<const K: usize>(y: &mut [f32], row: &[f32]) {
