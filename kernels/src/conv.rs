@@ -116,10 +116,45 @@ impl Conv {
     /// # Panics
     /// If a slice has another length, or `scratch` less than [`Conv::scratch_len`].
     pub fn forward(&self, n: usize, x: &[f32], weight: &[f32], bias: &[f32], y: &mut [f32], scratch: &mut [f32]) {
-        let any = self.check("conv forward", n, x.len(), y.len(), weight.len(), scratch.len());
-        assert_eq!(bias.len(), self.shape.oc, "conv forward: length of the bias of {:?}", self.shape);
-        if any {
-            forward(self.isa, self, x, weight, bias, y, scratch);
+        assert!(scratch.len() >= self.scratch_len(), "conv forward: scratch must have {} elements", self.scratch_len());
+        let (packed, scratch) = scratch.split_at_mut(self.packed_len());
+        self.pack(weight, bias, packed);
+        self.run_packed(n, x, packed, y, scratch);
+    }
+
+    /// Elements that the weights and bias of [`Conv::pack`] take.
+    pub fn packed_len(&self) -> usize {
+        self.sum.packed_len()
+    }
+
+    /// Puts weights and bias in the order in which [`Conv::forward_packed`] reads them.
+    ///
+    /// # Panics
+    /// If a slice has another length; that of `packed` is [`Conv::packed_len`].
+    pub fn pack(&self, weight: &[f32], bias: &[f32], packed: &mut [f32]) {
+        let shape = &self.shape;
+        assert_eq!(weight.len(), shape.oc * shape.taps(), "conv pack: length of the weights of {shape:?}");
+        assert_eq!(bias.len(), shape.oc, "conv pack: length of the bias of {shape:?}");
+        assert_eq!(packed.len(), self.packed_len(), "conv pack: length of the packed weights of {shape:?}");
+        pack(self.isa, self, weight, bias, packed);
+    }
+
+    /// As [`Conv::forward`], with weights and bias from [`Conv::pack`].
+    ///
+    /// # Panics
+    /// As [`Conv::forward`].
+    pub fn forward_packed(&self, n: usize, x: &[f32], packed: &[f32], y: &mut [f32], scratch: &mut [f32]) {
+        assert!(scratch.len() >= self.scratch_len(), "conv forward: scratch must have {} elements", self.scratch_len());
+        assert_eq!(packed.len(), self.packed_len(), "conv forward: length of the packed weights of {:?}", self.shape);
+        self.run_packed(n, x, packed, y, scratch);
+    }
+
+    fn run_packed(&self, n: usize, x: &[f32], packed: &[f32], y: &mut [f32], scratch: &mut [f32]) {
+        let shape = &self.shape;
+        assert_eq!(x.len(), n * shape.x_len(), "conv forward: length of the {n} inputs of {shape:?}");
+        assert_eq!(y.len(), n * shape.y_len(), "conv forward: length of the {n} outputs of {shape:?}");
+        if !y.is_empty() {
+            forward(self.isa, self, x, packed, y, scratch);
         }
     }
 
@@ -209,18 +244,15 @@ impl Conv {
 }
 
 per_isa! {
-    fn forward<S>(
-        simd: S,
-        conv: &Conv,
-        x: &[f32],
-        weight: &[f32],
-        bias: &[f32],
-        y: &mut [f32],
-        scratch: &mut [f32],
-    ) {
-        let (copy, packed) = scratch.split_at_mut(conv.copy_len(FORWARD_COPIES));
+    fn pack<S>(simd: S, conv: &Conv, weight: &[f32], bias: &[f32], packed: &mut [f32]) {
+        conv.sum.pack(simd, Some(bias), weight, packed);
+    }
+}
+
+per_isa! {
+    fn forward<S>(simd: S, conv: &Conv, x: &[f32], packed: &[f32], y: &mut [f32], scratch: &mut [f32]) {
+        let copy = &mut scratch[..conv.copy_len(FORWARD_COPIES)];
         let sum = &conv.sum;
-        sum.pack(simd, Some(bias), weight, packed);
         if !conv.layout.copies {
             return sum.run(simd, x, packed, y);
         }

@@ -7,7 +7,7 @@
 //! passes over `x`, with the whole batch between them: [`backward_sums`] and [`backward`], which puts the gradient of `x`
 //! in the place of `x`.
 
-use crate::simd::Simd;
+use crate::simd::{Simd, get, get_pairs, put, put_pairs};
 
 /// What follows the normalisation of `[n][c][h][w]` maps.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -183,36 +183,42 @@ fn forward_row(x: &[f32], scale: f32, shift: f32, slopes: Slopes, y: &mut [f32])
 fn forward_windows(x: &[f32], w: usize, scale: f32, shift: f32, slopes: Slopes, y: &mut [f32]) {
     let (above, below) = x.split_at(w);
     let windows = above.as_chunks::<2>().0.iter().zip(below.as_chunks::<2>().0);
-    let larger = |a: f32, b: f32| if a > b { a } else { b };
+    // Written out: a closure might not be inlined into the function with the instruction set.
     match slopes {
-        // These do not fall, so the largest can be taken first.
+        // This does not fall, so the largest can be taken first.
         Slopes::Zero => {
             for (y, (a, b)) in y.iter_mut().zip(windows) {
-                let z = [a[0], a[1], b[0], b[1]].map(|x| x * scale + shift);
-                *y = relu(larger(larger(z[0], z[1]), larger(z[2], z[3])), 0.0);
+                let (z0, z1) = (a[0] * scale + shift, a[1] * scale + shift);
+                let (z2, z3) = (b[0] * scale + shift, b[1] * scale + shift);
+                *y = relu(largest(z0, z1, z2, z3), 0.0);
             }
         }
         Slopes::PerChannel(slope) => {
             let slope = slope[0];
             for (y, (a, b)) in y.iter_mut().zip(windows) {
-                let f = [a[0], a[1], b[0], b[1]].map(|x| prelu(x * scale + shift, slope));
-                *y = larger(larger(f[0], f[1]), larger(f[2], f[3]));
+                let (f0, f1) = (prelu(a[0] * scale + shift, slope), prelu(a[1] * scale + shift, slope));
+                let (f2, f3) = (prelu(b[0] * scale + shift, slope), prelu(b[1] * scale + shift, slope));
+                *y = largest(f0, f1, f2, f3);
             }
         }
         Slopes::PerPosition(slopes) => {
             let (s_above, s_below) = slopes.split_at(w);
             let slopes = s_above.as_chunks::<2>().0.iter().zip(s_below.as_chunks::<2>().0);
             for ((y, (a, b)), (s, t)) in y.iter_mut().zip(windows).zip(slopes) {
-                let f = [
-                    prelu(a[0] * scale + shift, s[0]),
-                    prelu(a[1] * scale + shift, s[1]),
-                    prelu(b[0] * scale + shift, t[0]),
-                    prelu(b[1] * scale + shift, t[1]),
-                ];
-                *y = larger(larger(f[0], f[1]), larger(f[2], f[3]));
+                let (f0, f1) = (prelu(a[0] * scale + shift, s[0]), prelu(a[1] * scale + shift, s[1]));
+                let (f2, f3) = (prelu(b[0] * scale + shift, t[0]), prelu(b[1] * scale + shift, t[1]));
+                *y = largest(f0, f1, f2, f3);
             }
         }
     }
+}
+
+/// The largest of a window.
+#[inline(always)]
+fn largest(a: f32, b: f32, c: f32, d: f32) -> f32 {
+    let above = if a > b { a } else { b };
+    let below = if c > d { c } else { d };
+    if above > below { above } else { below }
 }
 
 /// How the slopes of a row are found: none, one for all, or a list.
@@ -245,34 +251,6 @@ struct Rows<'a> {
     /// Slopes, if there is one for each element.
     above: &'a [f32],
     below: &'a [f32],
-}
-
-#[inline(always)]
-fn get<S: Simd>(simd: S, from: &[f32], at: usize) -> S::V {
-    let from = &from[at..at + S::LANES];
-    // SAFETY: the slice has `LANES` elements.
-    unsafe { simd.load(from.as_ptr()) }
-}
-
-#[inline(always)]
-fn put<S: Simd>(simd: S, to: &mut [f32], at: usize, v: S::V) {
-    let to = &mut to[at..at + S::LANES];
-    // SAFETY: the slice has `LANES` elements.
-    unsafe { simd.store(to.as_mut_ptr(), v) };
-}
-
-#[inline(always)]
-fn get_pairs<S: Simd>(simd: S, from: &[f32], at: usize) -> [S::V; 2] {
-    let from = &from[at..at + 2 * S::LANES];
-    // SAFETY: the slice has twice `LANES` elements.
-    unsafe { simd.load_pairs(from.as_ptr()) }
-}
-
-#[inline(always)]
-fn put_pairs<S: Simd>(simd: S, to: &mut [f32], at: usize, v: [S::V; 2]) {
-    let to = &mut to[at..at + 2 * S::LANES];
-    // SAFETY: the slice has twice `LANES` elements.
-    unsafe { simd.store_pairs(to.as_mut_ptr(), v) };
 }
 
 #[inline(always)]

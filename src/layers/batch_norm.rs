@@ -17,7 +17,7 @@ use crate::tensor::Shape;
 /// The running variance keeps the population variance (divided by N, as in Keras 1, not by N − 1).
 ///
 /// Parameters: `gamma` and `beta` `[c]`; statistics: `running_mean` and `running_variance` `[c]`.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub struct BatchNorm {
     shape: Shape,
     epsilon: f32,

@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 use steersman_kernels::Isa;
 use steersman_kernels::conv::{Conv, ConvShape};
 
-use super::{Grads, Layer, Linear, Pair, ParamSpec, Pass};
+use super::{Grads, Layer, Linear, Pair, ParamSpec, Pass, Prepared};
 use crate::tensor::{Fans, Initializer, Shape};
 
 /// What lies beyond the border of the image.
@@ -40,7 +40,7 @@ impl Padding {
 /// Training and evaluation are the same. Any kernel size and stride.
 ///
 /// Parameters: `weight` `[filters][channels][kernel height][kernel width]`, `bias` `[filters]`.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub struct Conv2d {
     conv: Conv,
     shape: ConvShape,
@@ -140,8 +140,27 @@ impl Layer for Conv2d {
         }
     }
 
+    fn prepared(&self) -> Option<&dyn Prepared> {
+        Some(self)
+    }
+
     fn linear(&self) -> Option<&dyn Linear> {
         Some(self)
+    }
+}
+
+impl Prepared for Conv2d {
+    fn prepared_len(&self) -> usize {
+        self.conv.packed_len()
+    }
+
+    fn prepare(&self, params: &[f32], prepared: &mut [f32]) {
+        let (weight, bias) = self.split(params);
+        self.conv.pack(weight, bias, prepared);
+    }
+
+    fn infer_prepared(&self, prepared: &[f32], n: usize, x: &[f32], y: &mut [f32], scratch: &mut [f32]) {
+        self.conv.forward_packed(n, x, prepared, y, scratch);
     }
 }
 

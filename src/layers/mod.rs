@@ -161,6 +161,11 @@ pub trait Layer: Send + Sync + Debug {
     /// Gradients of the loss: overwrites `dx` where it is asked for, adds to `dparams`. `x` and `y` are those of `forward`.
     fn backward(&self, params: &[f32], pass: &Pass, n: usize, pair: Pair, dx: Option<&mut [f32]>, grads: Grads);
 
+    /// Evaluation with parameters prepared for it, for layers that gain by that.
+    fn prepared(&self) -> Option<&dyn Prepared> {
+        None
+    }
+
     /// The input gradient by itself, for layers that find it from `dy` and the parameters alone.
     fn linear(&self) -> Option<&dyn Linear> {
         None
@@ -190,6 +195,18 @@ pub struct Grads<'a> {
     pub dparams: &'a mut [f32],
     /// Working space.
     pub scratch: &'a mut [f32],
+}
+
+/// A layer that reads its parameters in another order than they are kept in.
+pub trait Prepared {
+    /// How many numbers the prepared parameters are.
+    fn prepared_len(&self) -> usize;
+
+    /// Overwrites `prepared`.
+    fn prepare(&self, params: &[f32], prepared: &mut [f32]);
+
+    /// As [`Layer::infer`], to the same bits.
+    fn infer_prepared(&self, prepared: &[f32], n: usize, x: &[f32], y: &mut [f32], scratch: &mut [f32]);
 }
 
 /// A layer whose input gradient needs neither input nor output, so that it may take the place of the input once

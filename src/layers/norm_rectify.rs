@@ -12,7 +12,7 @@ use crate::tensor::Shape;
 ///
 /// Not a [`Layer`], for the gradient of the input takes the place of the input. Parameters are those of the layers, one
 /// after the other.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub struct NormRectify {
     norm: BatchNorm,
     /// `None` for ReLU.

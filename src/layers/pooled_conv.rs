@@ -23,7 +23,7 @@ pub enum Rising {
 ///
 /// Where the activation makes different values equal (ELU far below 0), the gradient goes to the one that was the largest
 /// before, not to the first.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub struct PooledConv {
     conv: Conv2d,
     activation: Rising,
@@ -53,6 +53,26 @@ impl PooledConv {
         (map + self.output_len() + self.kernel().scratch_len()).max(n * self.output_len())
     }
 
+    /// Evaluation: overwrites `y`.
+    pub fn infer(&self, params: &[f32], n: usize, x: &[f32], y: &mut [f32], scratch: &mut [f32]) {
+        let (weight, bias) = self.conv.split(params);
+        let (map, scratch) = scratch.split_at_mut(self.pool.c * self.pool.h * self.pool.w);
+        let (pooled, scratch) = scratch.split_at_mut(self.output_len());
+        let images = x.chunks_exact(self.conv.input().len()).zip(y.chunks_exact_mut(self.output_len()));
+        for (x, y) in images.take(n) {
+            self.kernel().forward(1, x, weight, bias, map, scratch);
+            pool::max_forward(self.isa, &self.pool, 1, map, pooled);
+            self.activate(pooled, y);
+        }
+    }
+
+    fn activate(&self, x: &[f32], y: &mut [f32]) {
+        match self.activation {
+            Rising::Relu => activation::relu_forward(self.isa, x, y),
+            Rising::Elu(alpha) => activation::elu_forward(self.isa, alpha, x, y),
+        }
+    }
+
     /// Overwrites `y`, and `starts`, as long as `y`, with where the window of the convolution that was largest begins in a
     /// plane of the image.
     pub fn forward(&self, params: &[f32], n: usize, x: &[f32], y: &mut [f32], starts: &mut [u32], scratch: &mut [f32]) {
@@ -64,10 +84,7 @@ impl PooledConv {
         for (x, (y, starts)) in x.chunks_exact(input.len()).zip(outputs).take(n) {
             self.kernel().forward(1, x, weight, bias, map, scratch);
             pool::max_forward_with_places(self.isa, &self.pool, 1, input.w, map, pooled, starts);
-            match self.activation {
-                Rising::Relu => activation::relu_forward(self.isa, pooled, y),
-                Rising::Elu(alpha) => activation::elu_forward(self.isa, alpha, pooled, y),
-            }
+            self.activate(pooled, y);
         }
     }
 

@@ -12,6 +12,17 @@ pub(crate) fn supports(shape: &ConvShape) -> bool {
     (shape.stride_h, shape.stride_w, padding) == (1, 1, 0) && matches!((shape.kh, shape.kw), (3, 3) | (5, 5))
 }
 
+/// Every window must lie in a plane of the input.
+#[inline(always)]
+fn check<const K: usize>(shape: &ConvShape, starts: &[u32]) {
+    let reach = (K - 1) * shape.w + K;
+    let farthest = starts.iter().fold(0, |most, &start| if start > most { start } else { most });
+    assert!(
+        starts.is_empty() || farthest as usize + reach <= shape.h * shape.w,
+        "sparse conv gradient: a window outside the image"
+    );
+}
+
 per_isa! {
     /// Adds to `dweight` and `dbias`; `starts` and `dy` are `[n][oc][count]`.
     pub(crate) fn weight_gradient<S>(
@@ -42,6 +53,7 @@ fn weight_gradient_of<S: Simd, const K: usize>(
     dbias: &mut [f32],
 ) {
     let plane = shape.h * shape.w;
+    check::<K>(shape, starts);
     let images = x.len() / shape.x_len();
     let count = dy.len() / (images * shape.oc).max(1);
     for image in 0..images {
@@ -54,9 +66,9 @@ fn weight_gradient_of<S: Simd, const K: usize>(
                 let mut sums = [[0.0f32; K]; K];
                 for (&start, &dy) in starts.iter().zip(dy) {
                     for (ky, sums) in sums.iter_mut().enumerate() {
-                        let row = &x[start as usize + ky * shape.w..][..K];
                         for kx in 0..K {
-                            sums[kx] += dy * row[kx];
+                            // SAFETY: the window lies in the plane, by `check`.
+                            sums[kx] += dy * unsafe { x.get_unchecked(start as usize + ky * shape.w + kx) };
                         }
                     }
                 }
@@ -98,6 +110,7 @@ fn input_gradient_of<S: Simd, const K: usize>(
 ) {
     dx.fill(0.0);
     let plane = shape.h * shape.w;
+    check::<K>(shape, starts);
     let images = dx.len() / shape.x_len();
     let count = dy.len() / (images * shape.oc).max(1);
     for image in 0..images {
@@ -110,9 +123,9 @@ fn input_gradient_of<S: Simd, const K: usize>(
                 weights.as_flattened_mut().copy_from_slice(&weight[(o * shape.c + c) * K * K..][..K * K]);
                 for (&start, &dy) in starts.iter().zip(dy) {
                     for (ky, weights) in weights.iter().enumerate() {
-                        let row = &mut dx[start as usize + ky * shape.w..][..K];
                         for kx in 0..K {
-                            row[kx] += dy * weights[kx];
+                            // SAFETY: the window lies in the plane, by `check`.
+                            unsafe { *dx.get_unchecked_mut(start as usize + ky * shape.w + kx) += dy * weights[kx] };
                         }
                     }
                 }
