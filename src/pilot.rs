@@ -96,6 +96,21 @@ impl Pilot {
     ///
     /// [`Error::Usage`] if the image has no pixels, or not as many as it says.
     pub fn steer(&mut self, height: usize, width: usize, rgb: &[u8]) -> Result<f32> {
+        self.steer_observed(height, width, rgb, &mut |_, _| ())
+    }
+
+    /// As [`steer`](Self::steer), telling `seen` the place of each layer that computes something, and its output.
+    ///
+    /// # Errors
+    ///
+    /// As [`steer`](Self::steer).
+    pub fn steer_observed(
+        &mut self,
+        height: usize,
+        width: usize,
+        rgb: &[u8],
+        seen: &mut dyn FnMut(usize, &[f32]),
+    ) -> Result<f32> {
         if rgb.len() != height * width * 3 {
             return Err(Error::Usage(format!("{} bytes are no RGB image of {width}x{height} pixels", rgb.len())));
         }
@@ -105,7 +120,7 @@ impl Pilot {
         self.preprocessor.apply(rgb, &mut self.planes);
         self.model.recipe.preprocessing.to_input(&self.planes, &mut self.input);
         let mut steering = [0.0];
-        self.plan.run(&self.model.network, &self.model.parameters, &self.input, &mut steering);
+        self.plan.run_observed(&self.model.network, &self.model.parameters, &self.input, &mut steering, seen);
         Ok(steering[0])
     }
 

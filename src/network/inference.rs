@@ -51,23 +51,47 @@ impl InferencePlan {
         let groups = x.chunks(GROUP * input).zip(y.chunks_mut(GROUP * output)).zip(&mut self.workers);
         if n <= GROUP {
             for ((x, y), worker) in groups {
-                worker.run(network, parameters, x, y);
+                worker.run(network, parameters, x, y, &mut |_, _| ());
             }
         } else {
             x.par_chunks(GROUP * input)
                 .zip(y.par_chunks_mut(GROUP * output))
                 .zip(&mut self.workers)
-                .for_each(|((x, y), worker)| worker.run(network, parameters, x, y));
+                .for_each(|((x, y), worker)| worker.run(network, parameters, x, y, &mut |_, _| ()));
         }
+    }
+
+    /// As [`run`](Self::run) for one image, telling `seen` the place and the output of each layer that computes something.
+    ///
+    /// # Panics
+    ///
+    /// As [`run`](Self::run); also for more than one image.
+    pub fn run_observed(
+        &mut self,
+        network: &Network,
+        parameters: &Parameters,
+        x: &[f32],
+        y: &mut [f32],
+        seen: &mut dyn FnMut(usize, &[f32]),
+    ) {
+        assert_eq!((x.len(), y.len()), (network.input().len(), network.output().len()), "one image");
+        self.workers[0].run(network, parameters, x, y, seen);
     }
 }
 
 impl Worker {
-    fn run(&mut self, network: &Network, parameters: &Parameters, x: &[f32], y: &mut [f32]) {
+    fn run(
+        &mut self,
+        network: &Network,
+        parameters: &Parameters,
+        x: &[f32],
+        y: &mut [f32],
+        seen: &mut dyn FnMut(usize, &[f32]),
+    ) {
         let n = x.len() / network.input().len();
         let [current, next] = &mut self.buffers;
         let mut in_buffer = false;
-        for named in network.layers() {
+        for (index, named) in network.layers().iter().enumerate() {
             let layer = &named.layer;
             if layer.is_view() {
                 continue;
@@ -77,6 +101,7 @@ impl Worker {
             let statistics = &parameters.statistics[named.statistics.clone()];
             let output = &mut next[..n * layer.output().len()];
             layer.infer(params, statistics, n, input, output, &mut self.scratch);
+            seen(index, output);
             std::mem::swap(current, next);
             in_buffer = true;
         }
