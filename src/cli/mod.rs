@@ -7,12 +7,15 @@ mod bench;
 mod compare;
 mod drive;
 mod evaluate;
+mod experiment;
 mod explain;
 mod inspect;
 mod predict;
 mod progress;
 mod record;
+mod serve;
 mod share_bar;
+mod sim;
 mod summary;
 mod train;
 
@@ -42,7 +45,10 @@ enum Command {
     Train(train::TrainArgs),
     Record(record::RecordArgs),
     Drive(drive::DriveArgs),
+    Serve(serve::ServeArgs),
+    Sim(sim::SimArgs),
     Evaluate(evaluate::EvaluateArgs),
+    Experiment(experiment::ExperimentArgs),
     Predict(predict::PredictArgs),
     Inspect(inspect::InspectArgs),
     Explain(explain::ExplainArgs),
@@ -58,7 +64,10 @@ pub fn main() -> ExitCode {
         Command::Train(args) => train::run(args),
         Command::Record(args) => record::run(args),
         Command::Drive(args) => drive::run(args),
+        Command::Serve(args) => serve::run(args),
+        Command::Sim(args) => sim::run(args),
         Command::Evaluate(args) => evaluate::run(args),
+        Command::Experiment(args) => experiment::run(args),
         Command::Predict(args) => predict::run(args),
         Command::Inspect(args) => inspect::run(args),
         Command::Explain(args) => explain::run(args),

@@ -27,6 +27,8 @@ const STRAIGHT_DEG: f64 = 1.0;
 const LITTLE: f64 = 0.2;
 /// A change moves the angle much from here on.
 const MUCH: f64 = 0.5;
+/// What lies beside the road counts for more than the road itself from this many times its effect on.
+const BESIDE: f64 = 1.2;
 /// Share of the frames that must move the right way.
 const MOSTLY: f64 = 0.8;
 
@@ -317,13 +319,14 @@ fn verdict(change: Change, share: f64, right_way: Option<f64>, kept: [f64; 2]) -
         }
         Change::Mirror => {
             let passed = share <= MUCH && right_way.is_none_or(|share| share >= MOSTLY);
-            let said = right_way.map_or(String::new(), |share| format!(" in {:.0} % of the bends", 100.0 * share));
-            let words = if passed {
-                "steers to the other side, as it should"
-            } else {
-                "does not simply steer to the other side"
+            let share = right_way.map_or("-".into(), |share| format!("{:.0} %", 100.0 * share));
+            let words = match passed {
+                true => format!("steers to the other side, as it should, in {share} of the bends"),
+                false => {
+                    format!("the angle is not simply negated; it steers to the other side in {share} of the bends")
+                }
             };
-            (Some(passed), format!("{words}{said}"))
+            (Some(passed), words)
         }
         Change::ShiftLeft | Change::ShiftRight => {
             let right = right_way.unwrap_or(0.0);
@@ -347,7 +350,7 @@ fn conclusion(effects: &[Effect], spread_deg: f64) -> Vec<String> {
     let (road, beside) = (moved(Change::MaskRoad), moved(Change::MaskBeside));
     sentences.push(if !passed(Change::MaskRoad) {
         "It steers by something else than the road: without the road it steers nearly as before.".to_string()
-    } else if beside > road {
+    } else if beside > BESIDE * road {
         format!("It looks more at what lies beside the road ({beside:.1}° without it) than at the road itself ({road:.1}°): on roads with other surroundings it may be lost.")
     } else {
         format!("It steers by the road: without it the angle moves by {road:.1}°, without everything beside it by {beside:.1}°.")

@@ -198,7 +198,7 @@ impl Saliency {
                 let upper = at(i, j) * (1.0 - u) + at(i, j + 1) * u;
                 let lower = at(i + 1, j) * (1.0 - u) + at(i + 1, j + 1) * u;
                 let value = upper * (1.0 - t) + lower * t;
-                let (share, colour) = (OPACITY * value.sqrt(), [255.0, 230.0 * (1.0 - value), 0.0]);
+                let (share, colour) = (OPACITY * value, [255.0, 230.0 * (1.0 - value), 0.0]);
                 let below = image.pixel(row, column);
                 let mixed = |k: usize| f32::from(below[k]) * (1.0 - share) + colour[k] * share;
                 image.set_pixel(row, column, std::array::from_fn(|k| mixed(k).round() as u8));

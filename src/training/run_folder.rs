@@ -36,13 +36,17 @@ pub struct RunInfo {
 }
 
 impl RunFolder {
+    /// Name of the file in which the main job notes what follows on the training. It may be there before a run begins.
+    pub const JOB_NOTE: &str = "main-job.json";
+
     /// A new run in `path`, which must not exist or be empty.
     ///
     /// # Errors
     ///
     /// [`Error::Usage`] if there is something in it already, [`Error::Io`] if it cannot be made.
     pub fn create(path: &Path) -> Result<RunFolder> {
-        if path.exists() && std::fs::read_dir(path).map_err(Error::io(path))?.next().is_some() {
+        let taken = |entry: std::io::Result<std::fs::DirEntry>| entry.is_ok_and(|e| e.file_name() != Self::JOB_NOTE);
+        if path.exists() && std::fs::read_dir(path).map_err(Error::io(path))?.any(taken) {
             return Err(Error::Usage(format!(
                 "{} is not empty and stays as it is; give another folder with --out, or go on with that run: --resume {}",
                 path.display(),
@@ -71,6 +75,15 @@ impl RunFolder {
         (1..).map(|n| Path::new("runs").join(format!("{name}-{n}"))).find(|path| !path.exists()).expect("numbers go on")
     }
 
+    /// How the run was begun.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Io`] and [`Error::Data`] for a damaged folder.
+    pub fn info(&self) -> Result<RunInfo> {
+        self.read_json("run.json")
+    }
+
     /// A file in the folder.
     pub fn file(&self, name: &str) -> PathBuf {
         self.path.join(name)
@@ -79,15 +92,6 @@ impl RunFolder {
     /// The best model.
     pub fn model(&self) -> PathBuf {
         self.file("model.safetensors")
-    }
-
-    /// What `run.json` says.
-    ///
-    /// # Errors
-    ///
-    /// [`Error::Io`] and [`Error::Data`].
-    pub fn info(&self) -> Result<RunInfo> {
-        self.read_json("run.json")
     }
 
     /// The recipe of the run.

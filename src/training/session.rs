@@ -17,7 +17,7 @@ use crate::error::{Error, Result};
 use crate::model_file::{Model, TrainingRecord, weights_hash};
 use crate::network::{Network, StepInput, TrainingPlan};
 use crate::optimizer::Optimizer;
-use crate::recipe::Recipe;
+use crate::recipe::{Keep, Recipe};
 
 /// Most images of one row: three cameras, each mirrored. A batch of whole rows has at least one row.
 const IMAGES_OF_A_ROW: usize = 6;
@@ -51,11 +51,11 @@ pub trait Observer {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TrainResult {
-    /// Path of the best model.
+    /// Path of the model: the weights of the best epoch, or of the last one if the recipe keeps that.
     pub model: PathBuf,
     /// Epochs done.
     pub epochs: u32,
-    /// The epoch of the best model, from 1.
+    /// The epoch of the model, from 1; "best" below is this one.
     pub best_epoch: u32,
     /// Mean loss over the last epoch's training batches.
     pub train_mse: f64,
@@ -309,9 +309,9 @@ impl Session {
         progress.epoch += 1;
         (progress.next_batch, progress.loss_sum, progress.images, progress.train_seconds) = (0, 0.0, 0, 0.0);
 
-        // Without a validation side the latest weights are the best there are.
+        // Without a validation side the latest weights are the best there are; so they are if the recipe says so.
         let better = match (record.val_mse, progress.best_val_mse) {
-            (Some(now), Some(before)) => now < before,
+            (Some(now), Some(before)) => now < before || self.recipe.keep == Keep::Last,
             _ => true,
         };
         if better {
