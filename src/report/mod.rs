@@ -2,4 +2,4 @@
 
 mod metrics;
 
-pub use metrics::{Metrics, Prediction};
+pub use metrics::{Metrics, Prediction, correlation};
