@@ -6,6 +6,7 @@
 mod bench;
 mod drive;
 mod evaluate;
+mod import;
 mod inspect;
 mod predict;
 mod progress;
@@ -44,6 +45,7 @@ enum Command {
     Inspect(inspect::InspectArgs),
     Summary(summary::SummaryArgs),
     Bench(bench::BenchArgs),
+    Import(import::ImportArgs),
 }
 
 /// Runs the command line of this process.
@@ -58,6 +60,7 @@ pub fn main() -> ExitCode {
         Command::Inspect(args) => inspect::run(args),
         Command::Summary(args) => summary::run(args),
         Command::Bench(args) => bench::run(args, started),
+        Command::Import(args) => import::run(args),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,
