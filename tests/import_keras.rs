@@ -112,7 +112,9 @@ fn an_imported_model_is_like_any_other() {
     assert!((metrics["correlation"].as_f64().unwrap() - correlation(&fits[0])).abs() < 1e-6);
     let summary = String::from_utf8(run(folder.path(), &["summary", "m.safetensors"]).stdout).unwrap();
     assert!(summary.contains("leaky ReLU 0.2") && summary.contains("zero padding"), "{summary}");
-    run(folder.path(), &["drive", "m.safetensors", "--track", "lake", "--laps", "0.02"]);
+    assert!(summary.contains("not trained here"), "{summary}");
+    let frame = std::fs::read_dir(Path::new(&log).join("IMG")).unwrap().next().unwrap().unwrap().path();
+    run(folder.path(), &["predict", "m.safetensors", frame.to_str().unwrap()]);
 
     let again = error(folder.path(), &["import", golden("keras2.h5").to_str().unwrap(), "--out", "m.safetensors"]);
     assert!(again.contains("m.safetensors exists"), "{again}");
@@ -196,7 +198,13 @@ fn real_models_of_2017_steer() {
     let args = ["--preprocessing", "naokishibuya-2017-01-14", "--out", "second.safetensors"];
     let files = ["import", file.to_str().unwrap(), "--architecture", architecture.to_str().unwrap()];
     run(folder.path(), &[&files[..], &args].concat());
-    let earlier = correlation("second.safetensors", "lake-sample");
-    println!("correlation with the labels of the earlier model: {earlier:.3} on the lake");
-    assert!(lake > 0.6 && mountain > 0.5 && earlier > 0.4, "{lake} {mountain} {earlier}");
+    let (earlier_lake, earlier_mountain) =
+        (correlation("second.safetensors", "lake-sample"), correlation("second.safetensors", "mountain-keyboard"));
+    println!(
+        "correlation with the labels, earlier model: {earlier_lake:.3} on the lake, {earlier_mountain:.3} on the mountain"
+    );
+    // Keras itself, on every third row and with another resizing: 0.66, 0.32; 0.48, 0.62.
+    for (found, expected) in [(lake, 0.66), (mountain, 0.34), (earlier_lake, 0.48), (earlier_mountain, 0.63)] {
+        assert!((found - expected).abs() < 0.02, "{found} for {expected}");
+    }
 }

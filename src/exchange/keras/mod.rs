@@ -1,7 +1,7 @@
 //! Models that Keras saved: HDF5 of Keras 1 and 2, and the `.keras` archive of Keras 3.
 //!
-//! The way of a file: [`file`] opens it and finds architecture and weights; [`architecture`] reads the JSON into a chain of
-//! layers; [`translate`] says what each layer means here, [`lambda`] what a `Lambda` computes; [`assemble`] follows the shapes
+//! The way of a file: `file` opens it and finds architecture and weights; `architecture` reads the JSON into a chain of
+//! layers; `translate` says what each layer means here, `lambda` what a `Lambda` computes; `assemble` follows the shapes
 //! and brings the numbers into our order. Everything in a file is data and nothing in it is believed: what does not fit is an
 //! error that names the layer.
 //!
