@@ -11,6 +11,7 @@ use super::{or_dash, pool, print, print_json};
 use crate::dataset;
 use crate::dataset::colour::Colour;
 use crate::dataset::preprocess::Preprocessing;
+use crate::dataset::resize::Interpolation;
 use crate::error::{Error, Result};
 use crate::exchange::fit::{self, Candidate, Frames};
 use crate::exchange::keras::{self, ImportOptions, LayerReport};
@@ -195,8 +196,11 @@ fn ranking_table(ranking: &[Candidate]) -> String {
         "correlation", "colour", "rows", "resize", "method", "input"
     );
     for Candidate { preprocessing: p, correlation } in ranking {
-        let colour = serde_json::to_value(p.colour).ok().and_then(|name| name.as_str().map(String::from));
-        let method = serde_json::to_value(p.interpolation).ok().and_then(|name| name.as_str().map(String::from));
+        let colour = p.colour.name();
+        let method = match p.interpolation {
+            Interpolation::Linear => "linear",
+            Interpolation::Area => "area",
+        };
         let rows = format!("{} to {}", p.rows[0], p.rows[1]);
         let size = format!("{}x{}{}", p.resize[0], p.resize[1], if p.colour_first { " after" } else { "" });
         let scaling = match (p.scale, p.offset) {
@@ -206,8 +210,8 @@ fn ranking_table(ranking: &[Candidate]) -> String {
         text += &format!(
             "{:>11}  {:<12} {rows:<12} {size:<14} {:<8} {scaling}\n",
             or_dash(*correlation, 3),
-            colour.unwrap_or_default(),
-            method.unwrap_or_default(),
+            colour,
+            method,
         );
     }
     text

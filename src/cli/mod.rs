@@ -6,16 +6,20 @@
 mod bench;
 mod drive;
 mod evaluate;
+mod experiment;
 mod import;
 mod inspect;
 mod predict;
 mod progress;
 mod record;
+mod serve;
 mod share_bar;
+mod sim;
 mod summary;
 mod train;
 
 use std::io::{ErrorKind, Write};
+use std::path::Path;
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -40,7 +44,10 @@ enum Command {
     Train(train::TrainArgs),
     Record(record::RecordArgs),
     Drive(drive::DriveArgs),
+    Serve(serve::ServeArgs),
+    Sim(sim::SimArgs),
     Evaluate(evaluate::EvaluateArgs),
+    Experiment(experiment::ExperimentArgs),
     Predict(predict::PredictArgs),
     Inspect(inspect::InspectArgs),
     Summary(summary::SummaryArgs),
@@ -55,7 +62,10 @@ pub fn main() -> ExitCode {
         Command::Train(args) => train::run(args),
         Command::Record(args) => record::run(args),
         Command::Drive(args) => drive::run(args),
+        Command::Serve(args) => serve::run(args),
+        Command::Sim(args) => sim::run(args),
         Command::Evaluate(args) => evaluate::run(args),
+        Command::Experiment(args) => experiment::run(args),
         Command::Predict(args) => predict::run(args),
         Command::Inspect(args) => inspect::run(args),
         Command::Summary(args) => summary::run(args),
@@ -106,6 +116,20 @@ fn stop_on_ctrl_c() -> Result<Arc<AtomicBool>> {
     };
     ctrlc::set_handler(handler).map_err(|e| Error::Usage(format!("cannot listen for Ctrl-C: {e}")))?;
     Ok(stop)
+}
+
+/// Refuses an output that exists already.
+fn refuse_existing(path: &Path) -> Result<()> {
+    match path.exists() {
+        true => Err(Error::Usage(format!("{}: exists already and is not overwritten; name a new one", path.display()))),
+        false => Ok(()),
+    }
+}
+
+/// Makes the new folder `path`, and those it lies in.
+fn new_folder(path: &Path) -> Result<()> {
+    refuse_existing(path)?;
+    std::fs::create_dir_all(path).map_err(Error::io(path))
 }
 
 /// Prints `text`. Whoever reads may stop before the end, as `head` does.

@@ -4,7 +4,7 @@
 //! the stack lie constants and expressions `factor · x + offset`. Any instruction that leads away from these, or that is not
 //! known, makes the function unknown, and the user has to say what it computes.
 
-use base64::Engine;
+use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use serde_json::Value;
 

@@ -28,7 +28,6 @@ use crate::dataset::preprocess::Preprocessing;
 use crate::error::{Error, Result};
 use crate::model_file::{Model, TrainingRecord};
 use crate::network::{LayerSpec, Network, Parameters};
-use crate::optimizer::OptimizerSpec;
 use crate::recipe::Recipe;
 use crate::tensor::Shape;
 
@@ -81,33 +80,20 @@ impl Imported {
             )));
         }
         let version = self.keras_version.map_or(String::new(), |version| format!(" {version}"));
-        let recipe = Recipe {
-            name: name.into(),
-            about: format!("imported from Keras{version}"),
-            epochs: 10,
-            batch: 64,
-            full_lock_deg: 25.0,
-            loss: Default::default(),
-            clip_gradient_norm: None,
-            early_stopping: None,
-            layers: self.layers,
-            preprocessing,
-            samples: Default::default(),
-            balance: Default::default(),
-            augmentation: Default::default(),
-            split: Default::default(),
-            optimizer: OptimizerSpec::Adam {
-                learning_rate: 1e-4,
-                beta1: 0.9,
-                beta2: 0.999,
-                epsilon: 1e-8,
-                l2: 0.0,
-                decoupled_weight_decay: 0.0,
-            },
-            schedule: Default::default(),
+        let table = |e: toml::ser::Error| Error::Recipe { recipe: name.into(), message: e.to_string() };
+        let optimizer = toml::toml! {
+            kind = "adam"
+            learning_rate = 1e-4
         };
-        // Applies every check that a recipe file has to pass.
-        let recipe = Recipe::parse(name, &recipe.to_toml()?, &[])?;
+        let mut recipe = toml::Table::new();
+        recipe.insert("name".into(), name.into());
+        recipe.insert("about".into(), format!("imported from Keras{version}").into());
+        recipe.insert("epochs".into(), 10.into());
+        recipe.insert("batch".into(), 64.into());
+        recipe.insert("layers".into(), toml::Value::try_from(&self.layers).map_err(table)?);
+        recipe.insert("preprocessing".into(), toml::Value::try_from(&preprocessing).map_err(table)?);
+        recipe.insert("optimizer".into(), optimizer.into());
+        let recipe = Recipe::parse(name, &recipe.to_string(), &[])?;
         let record = TrainingRecord { version: env!("CARGO_PKG_VERSION").into(), ..TrainingRecord::default() };
         Ok(Model { recipe, parameters: self.parameters, record, training_rows: Vec::new() })
     }
