@@ -16,6 +16,7 @@ mod serve;
 mod share_bar;
 mod sim;
 mod summary;
+mod tracks;
 mod train;
 
 use std::io::{ErrorKind, Write};
@@ -50,6 +51,7 @@ enum Command {
     Experiment(experiment::ExperimentArgs),
     Predict(predict::PredictArgs),
     Inspect(inspect::InspectArgs),
+    Tracks(tracks::TracksArgs),
     Summary(summary::SummaryArgs),
     Bench(bench::BenchArgs),
     Import(import::ImportArgs),
@@ -68,6 +70,7 @@ pub fn main() -> ExitCode {
         Command::Experiment(args) => experiment::run(args),
         Command::Predict(args) => predict::run(args),
         Command::Inspect(args) => inspect::run(args),
+        Command::Tracks(args) => tracks::run(args),
         Command::Summary(args) => summary::run(args),
         Command::Bench(args) => bench::run(args, started),
         Command::Import(args) => import::run(args),
