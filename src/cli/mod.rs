@@ -9,6 +9,7 @@ mod drive;
 mod evaluate;
 mod experiment;
 mod explain;
+mod import;
 mod inspect;
 mod predict;
 mod progress;
@@ -57,6 +58,7 @@ enum Command {
     Compare(compare::CompareArgs),
     Summary(summary::SummaryArgs),
     Bench(bench::BenchArgs),
+    Import(import::ImportArgs),
 }
 
 /// Runs the command line of this process.
@@ -77,6 +79,7 @@ pub fn main() -> ExitCode {
         Command::Compare(args) => compare::run(args),
         Command::Summary(args) => summary::run(args),
         Command::Bench(args) => bench::run(args, started),
+        Command::Import(args) => import::run(args),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,
