@@ -10,6 +10,7 @@ mod inspect;
 mod predict;
 mod progress;
 mod record;
+mod serve;
 mod share_bar;
 mod sim;
 mod summary;
@@ -40,6 +41,7 @@ enum Command {
     Train(train::TrainArgs),
     Record(record::RecordArgs),
     Drive(drive::DriveArgs),
+    Serve(serve::ServeArgs),
     Sim(sim::SimArgs),
     Evaluate(evaluate::EvaluateArgs),
     Predict(predict::PredictArgs),
@@ -55,6 +57,7 @@ pub fn main() -> ExitCode {
         Command::Train(args) => train::run(args),
         Command::Record(args) => record::run(args),
         Command::Drive(args) => drive::run(args),
+        Command::Serve(args) => serve::run(args),
         Command::Sim(args) => sim::run(args),
         Command::Evaluate(args) => evaluate::run(args),
         Command::Predict(args) => predict::run(args),

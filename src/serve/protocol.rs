@@ -344,13 +344,13 @@ impl<'de> Deserialize<'de> for Number {
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Command {
     /// Steering, [-1, 1], + = right.
-    pub steering: f64,
+    pub steering: f32,
     /// Accelerator from 0 to 1, brake from 0 to -1.
-    pub throttle: f64,
+    pub throttle: f32,
 }
 
-/// Appends a `steer` event. Numbers are the shortest decimals that read back as the same, without exponents; what is not
-/// finite becomes 0, because the simulator would drop the message and wait for ever.
+/// Appends a `steer` event. Numbers are the shortest decimals that read back as the same 32 bits, which is what the
+/// simulator keeps, without exponents; what is not finite becomes 0, because the simulator would drop the message and wait for ever.
 pub fn print_steer(out: &mut String, command: Command, style: NumberStyle) {
     out.push_str("42[\"steer\",{\"steering_angle\":");
     print_number(out, command.steering, style);
@@ -359,7 +359,7 @@ pub fn print_steer(out: &mut String, command: Command, style: NumberStyle) {
     out.push_str("}]");
 }
 
-fn print_number(out: &mut String, value: f64, style: NumberStyle) {
+fn print_number(out: &mut String, value: f32, style: NumberStyle) {
     let value = if value.is_finite() { value } else { 0.0 };
     match style {
         NumberStyle::Numbers => push(out, format_args!("{value}")),

@@ -32,7 +32,9 @@ impl Peer {
             match self.0.read() {
                 Ok(Message::Text(text)) if skip.is_empty() || !text.starts_with(skip) => return Some(text.to_string()),
                 Ok(Message::Text(_) | Message::Ping(_) | Message::Pong(_)) => {}
-                Ok(Message::Close(_)) | Err(tungstenite::Error::ConnectionClosed | tungstenite::Error::Protocol(_)) => return None,
+                Ok(Message::Close(_)) | Err(tungstenite::Error::ConnectionClosed | tungstenite::Error::Protocol(_)) => {
+                    return None;
+                }
                 Err(tungstenite::Error::Io(e)) if e.kind() == std::io::ErrorKind::ConnectionReset => return None,
                 other => panic!("{other:?}"),
             }
