@@ -13,6 +13,7 @@ use tungstenite::{Message, Utf8Bytes, WebSocket};
 use super::handshake::{Client, MAX_HEAD, Verdict, examine};
 use super::helm::{Clock, Helm};
 use super::journal::Event;
+use super::pace::Pace;
 use super::protocol::{
     self, ClientPacket, Command, DecimalMark, EngineVersion, NumberStyle, PING_INTERVAL_MS, PING_TIMEOUT_MS,
     ProtocolError, Telemetry,
@@ -168,12 +169,12 @@ fn open<'a>(shared: &'a Shared, peer: &'a Arc<Peer>, address: SocketAddr) -> Res
         last_ping: now,
         last_telemetry: None,
         last_question: now,
-        telemetry_seen: false,
         held: None,
         faults: 0,
         style: NumberStyle::default(),
         helm: Helm::new(shared.options.helm),
         waits: false,
+        pace: Pace::new(now),
         lockstep: false,
         overridden: false,
         cut: false,
@@ -218,7 +219,6 @@ struct Connection<'a> {
     last_telemetry: Option<Instant>,
     /// When telemetry was last asked for, without telemetry to answer.
     last_question: Instant,
-    telemetry_seen: bool,
     tokens: Tokens,
     /// Telemetry that is not answered yet, and when its last byte came.
     held: Option<(Utf8Bytes, Instant)>,
@@ -226,6 +226,8 @@ struct Connection<'a> {
     faults: u32,
     style: NumberStyle,
     helm: Helm,
+    /// How much of a stranger's messages is read.
+    pace: Pace,
     /// Was told that another drives.
     waits: bool,
     /// The client waits for each answer: its clock counts, and the server's has no meaning for it.
@@ -250,22 +252,32 @@ impl Connection<'_> {
                 return Ok(());
             }
             self.websocket.get_mut().begin_beat();
+            let mut messages = 1;
             if let Some(message) = self.read()? {
+                let mut bytes = message.0.len();
                 batch.push(message);
                 // Whatever else is complete already: of several telemetries only the newest is answered.
                 self.websocket.get_mut().set_waiting(false)?;
-                while batch.len() < MAX_BATCH {
+                while batch.len() < MAX_BATCH && bytes < MAX_MESSAGE {
                     match self.read() {
-                        Ok(Some(message)) => batch.push(message),
+                        Ok(Some(message)) => {
+                            bytes += message.0.len();
+                            batch.push(message);
+                        }
                         Ok(None) => break,
                         // What came before it is still served; the next read meets the same end.
                         Err(_) => break,
                     }
                 }
                 self.websocket.get_mut().set_waiting(true)?;
+                messages = batch.len();
                 self.take(&mut batch)?;
             }
             self.after_beat()?;
+            let bytes = self.websocket.get_mut().take_count();
+            if bytes > 0 && self.peer.stage() != Stage::Trusted {
+                std::thread::sleep(self.pace.charge(messages, bytes, Instant::now()));
+            }
         }
     }
 
@@ -303,6 +315,7 @@ impl Connection<'_> {
                 self.show('>', text);
                 if is_state(packet) {
                     self.tokens.received(*came);
+                    self.last_telemetry = Some(*came);
                     self.acknowledge(packet)?;
                     if self.held.take().is_some() {
                         self.shared.statistics().superseded += 1;
@@ -351,6 +364,8 @@ impl Connection<'_> {
     fn after_beat(&mut self) -> Result<(), End> {
         if let Some((text, came)) = self.held.take() {
             if self.may_answer() {
+                // Waiting for another client to leave is no delay of the answer.
+                let came = if self.waits { Instant::now() } else { came };
                 if let Ok(packet) = protocol::parse(&text) {
                     self.answer(packet, came)?;
                 }
@@ -359,7 +374,7 @@ impl Connection<'_> {
             }
         }
         let now = Instant::now();
-        if !self.client.is_simulator() && !self.telemetry_seen {
+        if !self.client.is_simulator() && self.last_telemetry.is_none() {
             self.greet(now)?;
         }
         self.keep_alive(now)?;
@@ -497,8 +512,6 @@ impl Connection<'_> {
 
     /// Answers the newest telemetry, whose last byte came at `came`.
     fn answer(&mut self, packet: ClientPacket, came: Instant) -> Result<(), End> {
-        self.telemetry_seen = true;
-        self.last_telemetry = Some(came);
         let telemetry = match packet {
             ClientPacket::Telemetry(telemetry, _) => telemetry,
             _ => return self.let_person_drive(came),
@@ -522,6 +535,7 @@ impl Connection<'_> {
             Claim::Kept => {}
             Claim::Taken => {
                 self.peer.set_stage(Stage::Trusted);
+                self.waits = false;
                 self.shared.journal.report(Event::Drives, format_args!("{} is driven", self.address));
             }
             // Another was faster; this client's token is kept by asking for its next telemetry.

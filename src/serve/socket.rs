@@ -16,6 +16,7 @@ pub(super) struct Socket {
     beat: Duration,
     beat_began: Instant,
     waiting: bool,
+    count: usize,
 }
 
 impl Socket {
@@ -26,12 +27,17 @@ impl Socket {
         stream.set_write_timeout(Some(WRITE_TIMEOUT))?;
         stream.set_read_timeout(Some(beat))?;
         let now = Instant::now();
-        Ok(Socket { stream, last_byte: now, beat, beat_began: now, waiting: true })
+        Ok(Socket { stream, last_byte: now, beat, beat_began: now, waiting: true, count: 0 })
     }
 
     /// When the last byte came.
     pub fn last_byte(&self) -> Instant {
         self.last_byte
+    }
+
+    /// Bytes read since this was last asked.
+    pub fn take_count(&mut self) -> usize {
+        std::mem::take(&mut self.count)
     }
 
     /// Changes the beat.
@@ -77,6 +83,7 @@ impl Read for Socket {
         }
         let len = self.stream.read(buffer)?;
         self.last_byte = Instant::now();
+        self.count += len;
         self.acknowledge();
         Ok(len)
     }
@@ -84,7 +91,10 @@ impl Read for Socket {
 
 impl Write for Socket {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        self.stream.write(bytes)
+        let len = self.stream.write(bytes)?;
+        // After a reply the system expects another and delays acknowledgements again.
+        self.acknowledge();
+        Ok(len)
     }
 
     fn flush(&mut self) -> io::Result<()> {
