@@ -65,8 +65,10 @@ impl Pilot {
         let Model { recipe, parameters, .. } = model;
         let network = recipe.network(isa)?;
         let [height, width] = recipe.preprocessing.source;
+        let mut plan = InferencePlan::new(&network, 1);
+        plan.prepare(&network, &parameters);
         Ok(Pilot {
-            plan: InferencePlan::new(&network, 1),
+            plan,
             preprocessor: recipe.preprocessing.plan(height, width)?,
             image: RgbImage::default(),
             planes: vec![0; recipe.preprocessing.output_len()],
@@ -78,6 +80,16 @@ impl Pilot {
     /// How the model was made.
     pub fn recipe(&self) -> &Recipe {
         &self.model.recipe
+    }
+
+    /// The network that steers.
+    pub fn network(&self) -> &Network {
+        &self.model.network
+    }
+
+    /// The numbers of the network.
+    pub fn parameters(&self) -> &Parameters {
+        &self.model.parameters
     }
 
     /// Steering for an RGB image, `[height][width][3]`. Roughly in [−1, 1], positive to the right; not clamped.
@@ -95,7 +107,7 @@ impl Pilot {
         self.preprocessor.apply(rgb, &mut self.planes);
         self.model.recipe.preprocessing.to_input(&self.planes, &mut self.input);
         let mut steering = [0.0];
-        self.plan.run(&self.model.network, &self.model.parameters, &self.input, &mut steering);
+        self.plan.run_prepared(&self.model.network, &self.model.parameters, &self.input, &mut steering);
         Ok(steering[0])
     }
 

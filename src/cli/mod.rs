@@ -6,6 +6,7 @@
 mod bench;
 mod drive;
 mod evaluate;
+mod experiment;
 mod inspect;
 mod predict;
 mod progress;
@@ -14,9 +15,11 @@ mod serve;
 mod share_bar;
 mod sim;
 mod summary;
+mod tracks;
 mod train;
 
 use std::io::{ErrorKind, Write};
+use std::path::Path;
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -44,8 +47,10 @@ enum Command {
     Serve(serve::ServeArgs),
     Sim(sim::SimArgs),
     Evaluate(evaluate::EvaluateArgs),
+    Experiment(experiment::ExperimentArgs),
     Predict(predict::PredictArgs),
     Inspect(inspect::InspectArgs),
+    Tracks(tracks::TracksArgs),
     Summary(summary::SummaryArgs),
     Bench(bench::BenchArgs),
 }
@@ -60,8 +65,10 @@ pub fn main() -> ExitCode {
         Command::Serve(args) => serve::run(args),
         Command::Sim(args) => sim::run(args),
         Command::Evaluate(args) => evaluate::run(args),
+        Command::Experiment(args) => experiment::run(args),
         Command::Predict(args) => predict::run(args),
         Command::Inspect(args) => inspect::run(args),
+        Command::Tracks(args) => tracks::run(args),
         Command::Summary(args) => summary::run(args),
         Command::Bench(args) => bench::run(args, started),
     };
@@ -109,6 +116,20 @@ fn stop_on_ctrl_c() -> Result<Arc<AtomicBool>> {
     };
     ctrlc::set_handler(handler).map_err(|e| Error::Usage(format!("cannot listen for Ctrl-C: {e}")))?;
     Ok(stop)
+}
+
+/// Refuses an output that exists already.
+fn refuse_existing(path: &Path) -> Result<()> {
+    match path.exists() {
+        true => Err(Error::Usage(format!("{}: exists already and is not overwritten; name a new one", path.display()))),
+        false => Ok(()),
+    }
+}
+
+/// Makes the new folder `path`, and those it lies in.
+fn new_folder(path: &Path) -> Result<()> {
+    refuse_existing(path)?;
+    std::fs::create_dir_all(path).map_err(Error::io(path))
 }
 
 /// Prints `text`. Whoever reads may stop before the end, as `head` does.

@@ -78,9 +78,7 @@ impl<'a> ClosedLoop<'a> {
 
     /// Whether there is more to drive: not all laps, no failure, and not far too slow.
     pub fn goes_on(&self) -> bool {
-        self.simulation.progress_m < self.way_m
-            && self.simulation.steps < self.most_steps
-            && self.run.failure.is_none()
+        self.simulation.progress_m < self.way_m && self.simulation.steps < self.most_steps && self.run.failure.is_none()
     }
 
     /// Whether a frame is to be answered before the next step.

@@ -280,13 +280,13 @@ mod tests {
     #[test]
     fn what_no_server_may_send_is_an_error() {
         for bytes in [
-            &b"\xc1\x00"[..],                              // reserved bit
-            b"\x81\x80\0\0\0\0",                           // masked
-            b"\x80\x01a",                                  // continuation of nothing
-            b"\x01\x01a\x81\x01b",                         // a text within a text
-            b"\x09\x00",                                   // fragmented ping
-            b"\x83\x00",                                   // unknown opcode
-            b"\x81\x7f\x7f\xff\xff\xff\xff\xff\xff\xff",   // longer than memory
+            &b"\xc1\x00"[..],                            // reserved bit
+            b"\x81\x80\0\0\0\0",                         // masked
+            b"\x80\x01a",                                // continuation of nothing
+            b"\x01\x01a\x81\x01b",                       // a text within a text
+            b"\x09\x00",                                 // fragmented ping
+            b"\x83\x00",                                 // unknown opcode
+            b"\x81\x7f\x7f\xff\xff\xff\xff\xff\xff\xff", // longer than memory
         ] {
             let read = read(bytes);
             assert_eq!(read.last().unwrap().as_ref().unwrap_err().kind(), io::ErrorKind::InvalidData, "{bytes:?}");

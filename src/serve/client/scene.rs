@@ -344,7 +344,9 @@ impl<'a> Scene<'a> {
         }
         let Scene { options: ClientOptions { url, patience_s, .. }, trouble, .. } = self;
         Err(Error::Usage(match (trouble.is_empty(), self.report.telemetries) {
-            (false, _) => format!("{url}: {trouble}, for {patience_s} s; start `steersman serve MODEL` and give its port"),
+            (false, _) => {
+                format!("{url}: {trouble}, for {patience_s} s; start `steersman serve MODEL` and give its port")
+            }
             (true, 0) => format!("{url}: nothing came for {patience_s} s after the connection opened"),
             (true, sent) => format!("{url}: no reply to telemetry for {patience_s} s, after {sent} telemetries"),
         }))
