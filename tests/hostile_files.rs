@@ -286,16 +286,15 @@ fn valid_files_that_mean_harm_are_refused() {
     // An archive of kilobytes that unpacks to hundreds of megabytes.
     let mut entries = entries("keras3.keras");
     let place = entries.iter().position(|(name, _)| name == "config.json").unwrap();
-    let config = std::mem::replace(&mut entries[place].1, vec![b' '; 300 << 20]);
+    entries[place].1 = vec![b' '; 300 << 20];
     let bomb = archive(&entries);
-    entries[place].1 = Vec::new();
     assert!(bomb.len() < 1 << 20);
     let message = refused(&bomb);
     assert!(message.contains("unpacks to more than"), "{message}");
     // Brackets without end.
-    entries[place].1 = [&config[..config.len() / 2], &b"[".repeat(1 << 20)].concat();
+    entries[place].1 = b"[".repeat(100_000);
     assert!(refused(&archive(&entries)).contains("no JSON"));
-    // The same archive twice over, and an archive of nothing.
+    // An archive of nothing, and one without weights.
     assert!(!refused(&archive(&[])).is_empty());
     assert!(!refused(&archive(&entries[..1])).is_empty());
 }

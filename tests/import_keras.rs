@@ -109,7 +109,7 @@ fn an_imported_model_is_like_any_other() {
 
     let metrics = json(folder.path(), &["evaluate", "m.safetensors", &log, "--json"]);
     assert_eq!(metrics["rows"], 30);
-    assert!((metrics["correlation"].as_f64().unwrap() - correlation(&fits[0])).abs() < 1e-6);
+    assert!((metrics["correlation"].as_f64().unwrap() - correlation(&fits[0])).abs() < 1e-4);
     let summary = String::from_utf8(run(folder.path(), &["summary", "m.safetensors"]).stdout).unwrap();
     assert!(summary.contains("leaky ReLU 0.2") && summary.contains("zero padding"), "{summary}");
     assert!(summary.contains("not trained here"), "{summary}");
