@@ -33,6 +33,7 @@ fn learn(folder: &Path, threads: usize) -> (TrainResult, TrackResult) {
             out: folder.join(format!("run-{threads}")),
             seed: 1,
             cache_mib: 256,
+            from: None,
         };
         let result = train(request, &mut Silent, &AtomicBool::new(false)).unwrap();
         let pilot = Pilot::load(&result.model).unwrap();

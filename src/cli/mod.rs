@@ -6,6 +6,7 @@
 mod bench;
 mod drive;
 mod evaluate;
+mod export;
 mod inspect;
 mod predict;
 mod progress;
@@ -15,6 +16,7 @@ mod summary;
 mod train;
 
 use std::io::{ErrorKind, Write};
+use std::path::Path;
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -24,6 +26,7 @@ use clap::{Args, Parser, Subcommand};
 use serde::Serialize;
 
 use crate::error::{Error, Result};
+use crate::model_file::Model;
 use crate::recipe::Recipe;
 
 /// Learn to steer a car from its front camera, and drive with what was learned.
@@ -41,6 +44,7 @@ enum Command {
     Drive(drive::DriveArgs),
     Evaluate(evaluate::EvaluateArgs),
     Predict(predict::PredictArgs),
+    Export(export::ExportArgs),
     Inspect(inspect::InspectArgs),
     Summary(summary::SummaryArgs),
     Bench(bench::BenchArgs),
@@ -55,6 +59,7 @@ pub fn main() -> ExitCode {
         Command::Drive(args) => drive::run(args),
         Command::Evaluate(args) => evaluate::run(args),
         Command::Predict(args) => predict::run(args),
+        Command::Export(args) => export::run(args),
         Command::Inspect(args) => inspect::run(args),
         Command::Summary(args) => summary::run(args),
         Command::Bench(args) => bench::run(args, started),
@@ -72,9 +77,9 @@ pub fn main() -> ExitCode {
 /// Which recipe, and what to change in it.
 #[derive(Clone, Debug, Args)]
 struct RecipeArgs {
-    /// A built-in recipe (default, hyper, hyper-prelu, lenet, pilotnet) or a recipe file
-    #[arg(long, value_name = "NAME|FILE", default_value = "default")]
-    recipe: String,
+    /// A built-in recipe (default, hyper, hyper-prelu, lenet, pilotnet) or a recipe file [default: default]
+    #[arg(long, value_name = "NAME|FILE")]
+    recipe: Option<String>,
     /// Change an entry of the recipe, as in epochs=3 or optimizer.learning_rate=1e-4
     #[arg(long = "set", value_name = "KEY=VALUE")]
     overrides: Vec<String>,
@@ -82,7 +87,15 @@ struct RecipeArgs {
 
 impl RecipeArgs {
     fn find(&self) -> Result<Recipe> {
-        Recipe::find(&self.recipe, &self.overrides)
+        Recipe::find(self.recipe.as_deref().unwrap_or("default"), &self.overrides)
+    }
+
+    /// The recipe that is named, or else that of the model in the file `from`.
+    fn find_or_of(&self, from: &Path) -> Result<Recipe> {
+        match self.recipe {
+            Some(_) => self.find(),
+            None => Recipe::parse(&from.display().to_string(), &Model::load(from)?.recipe.to_toml()?, &self.overrides),
+        }
     }
 }
 

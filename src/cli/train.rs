@@ -14,7 +14,7 @@ use crate::main_job::held_out::trained_on_held_out;
 use crate::main_job::{MainJobResult, TRACKS, TrackResult, held_out, test_on_track, training_set};
 use crate::pilot::Pilot;
 use crate::simulator::{DriveOptions, Track};
-use crate::training::{self, RunFolder, TrainRequest, TrainResult};
+use crate::training::{self, RunFolder, TrainRequest, TrainResult, TransferRequest};
 
 /// Train a network on recordings
 #[derive(Debug, Args)]
@@ -31,6 +31,12 @@ pub struct TrainArgs {
     /// Seed of all random choices: the same seed gives the same weights, bit for bit, for any number of threads
     #[arg(long, default_value_t = 1)]
     seed: u64,
+    /// Begin with the weights of a model where layers have the same name and shape; without --recipe, with its recipe
+    #[arg(long, value_name = "MODEL", requires = "recordings", conflicts_with = "resume")]
+    from: Option<PathBuf>,
+    /// Layers that keep the weights they were given, as in conv1,bn1
+    #[arg(long, value_name = "LAYER", requires = "from", value_delimiter = ',')]
+    freeze: Vec<String>,
     /// Threads; 0 is one for each core
     #[arg(long, default_value_t = 0)]
     threads: usize,
@@ -69,7 +75,10 @@ pub fn run(args: TrainArgs) -> Result<()> {
             (folder, result)
         }
         None => {
-            let recipe = args.recipe.find()?;
+            let recipe = match &args.from {
+                Some(from) => args.recipe.find_or_of(from)?,
+                None => args.recipe.find()?,
+            };
             let recordings = match whole_job {
                 true => pool.install(|| training_set(&stop))?,
                 false => args.recordings,
@@ -80,7 +89,9 @@ pub fn run(args: TrainArgs) -> Result<()> {
             }
             let out = args.out.unwrap_or_else(|| RunFolder::next_free(&recipe.name));
             let mut progress = Progress::new();
-            let request = TrainRequest { recordings, recipe, out: out.clone(), seed: args.seed, cache_mib: args.cache };
+            let from = args.from.map(|model| TransferRequest { model, freeze: args.freeze });
+            let (seed, cache_mib) = (args.seed, args.cache);
+            let request = TrainRequest { recordings, recipe, out: out.clone(), seed, cache_mib, from };
             let result = pool.install(|| training::train(request, &mut progress, &stop));
             (out, result)
         }

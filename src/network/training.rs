@@ -58,6 +58,8 @@ pub struct TrainingPlan {
     segments: Vec<Range<usize>>,
     /// For each layer, which earlier layer's output is its input; `None` is the batch itself.
     source: Vec<Option<usize>>,
+    /// The first layer that learns: below it nobody asks for a gradient.
+    first_learning: usize,
     capacity: usize,
     isa: Isa,
 }
@@ -90,7 +92,7 @@ impl TrainingPlan {
             let len = barrier.map_or(0, BatchStatistics::moments_len);
             moments_of.push(moments_end..moments_end + len);
             moments_end += len;
-            if let Some(barrier) = barrier {
+            if let Some(barrier) = barrier.filter(|_| !layer.frozen) {
                 sums_len = sums_len.max(barrier.sums_len());
                 segment_starts.push(index);
             }
@@ -133,6 +135,7 @@ impl TrainingPlan {
             sums: vec![0.0; sums_len],
             segments,
             source,
+            first_learning: layers.iter().position(|l| !l.params.is_empty() && !l.frozen).unwrap_or(layers.len()),
             capacity,
             isa: network.isa(),
         }
@@ -166,6 +169,13 @@ impl TrainingPlan {
         assert_eq!(input.labels.len(), n * network.output().len());
         assert_eq!(network.layers().len(), self.source.len());
 
+        for (layer, moments_of) in network.layers().iter().zip(&self.moments_of).filter(|(layer, _)| layer.frozen) {
+            if let Some(statistics) = layer.layer.batch_statistics() {
+                let params = &parameters.values[layer.params.clone()];
+                let running = &parameters.statistics[layer.statistics.clone()];
+                statistics.frozen_moments(params, running, &mut self.moments[moments_of.clone()]);
+            }
+        }
         let shard_images = n.div_ceil(MAX_SHARDS);
         let used = n.div_ceil(shard_images);
         for (index, shard) in self.shards[..used].iter_mut().enumerate() {
@@ -176,7 +186,7 @@ impl TrainingPlan {
         } else {
             self.step_with_barriers(network, parameters, loss, input, used);
         }
-        self.reduce_gradient(used);
+        self.reduce_gradient(network, used);
         self.shards[..used].iter().map(|shard| shard.loss).sum::<f64>() / input.labels.len() as f64
     }
 
@@ -188,8 +198,8 @@ impl TrainingPlan {
         input: StepInput,
         used: usize,
     ) {
-        let TrainingPlan { shards, source, .. } = self;
-        let run = Run { network, parameters, source, moments: &[], moments_of: &[], input };
+        let TrainingPlan { shards, source, moments, moments_of, first_learning, .. } = self;
+        let run = Run { network, parameters, source, moments, moments_of, first_learning: *first_learning, input };
         shards[..used].par_iter_mut().for_each(|shard| {
             shard.reset();
             let group = shard.group_capacity(network);
@@ -210,14 +220,15 @@ impl TrainingPlan {
         input: StepInput,
         used: usize,
     ) {
-        let TrainingPlan { shards, moments, moments_of, sums, segments, source, .. } = self;
+        let TrainingPlan { shards, moments, moments_of, sums, segments, source, first_learning, .. } = self;
+        let first_learning = *first_learning;
         let shards = &mut shards[..used];
         let images = shards.last().map_or(0, |shard| shard.images.end);
         let layers = network.layers();
         let last = segments.len() - 1;
 
         for (index, segment) in segments.iter().enumerate() {
-            let run = Run { network, parameters, source, moments, moments_of, input };
+            let run = Run { network, parameters, source, moments, moments_of, first_learning, input };
             let next_barrier = segments.get(index + 1).map(|next| next.start);
             shards.par_iter_mut().for_each(|shard| {
                 if index == 0 {
@@ -242,7 +253,7 @@ impl TrainingPlan {
             }
         }
         for (index, segment) in segments.iter().enumerate().rev() {
-            let run = Run { network, parameters, source, moments, moments_of, input };
+            let run = Run { network, parameters, source, moments, moments_of, first_learning, input };
             // The layer at the start of a segment waits for the sums over all shards.
             let rest = if index > 0 { segment.start + 1..segment.end } else { segment.clone() };
             shards.par_iter_mut().for_each(|shard| {
@@ -265,8 +276,8 @@ impl TrainingPlan {
         }
     }
 
-    /// Adds the shards' gradients up, in their order.
-    fn reduce_gradient(&mut self, used: usize) {
+    /// Adds the shards' gradients up, in their order. Those of frozen layers count as 0.
+    fn reduce_gradient(&mut self, network: &Network, used: usize) {
         let TrainingPlan { shards, gradient, chunk_squares, isa, .. } = self;
         let shards = &shards[..used];
         gradient.par_chunks_mut(CHUNK).zip(chunk_squares.par_iter_mut()).enumerate().for_each(
@@ -275,6 +286,12 @@ impl TrainingPlan {
                 chunk.copy_from_slice(&shards[0].gradient[range.clone()]);
                 for shard in &shards[1..] {
                     update::sum_into(*isa, chunk, &shard.gradient[range.clone()]);
+                }
+                for layer in network.layers().iter().filter(|layer| layer.frozen) {
+                    let (from, to) = (layer.params.start.max(range.start), layer.params.end.min(range.end));
+                    if from < to {
+                        chunk[from - range.start..to - range.start].fill(0.0);
+                    }
                 }
                 *squares = update::sum_of_squares(*isa, chunk);
             },
@@ -323,12 +340,13 @@ struct Run<'a> {
     source: &'a [Option<usize>],
     moments: &'a [f32],
     moments_of: &'a [Range<usize>],
+    first_learning: usize,
     input: StepInput<'a>,
 }
 
 impl<'a> Run<'a> {
     fn pass(&self, layer: usize, first_image: usize) -> Pass<'a> {
-        let moments = self.moments_of.get(layer).map_or(&[][..], |range| &self.moments[range.clone()]);
+        let moments = &self.moments[self.moments_of[layer].clone()];
         Pass { seed: self.input.seed, step: self.input.step, layer, first_image, moments }
     }
 
@@ -380,15 +398,16 @@ impl<'a> Run<'a> {
     fn backward(&self, layers: Range<usize>, shard: &mut Shard, images: Range<usize>) {
         for index in layers.rev() {
             let layer = &self.network.layers()[index].layer;
-            if layer.is_view() {
+            if layer.is_view() || index < self.first_learning {
                 continue;
             }
             let n = images.len();
             let (x_len, y_len) = (n * layer.input().len(), n * layer.output().len());
             let x = self.layer_input(index, &shard.activations, images.clone());
             let pair = Pair { x, y: &shard.activations[index][..y_len], dy: &shard.d_output[..y_len] };
-            // Nobody asks for the gradient of the images themselves.
-            let dx = self.source[index].map(|_| &mut shard.d_input[..x_len]);
+            // Nobody asks for the gradient of the images themselves, or of layers that do not learn.
+            let dx = self.source[index].filter(|source| *source >= self.first_learning);
+            let dx = dx.map(|_| &mut shard.d_input[..x_len]);
             let range = self.network.layers()[index].params.clone();
             let grads = Grads { dparams: &mut shard.gradient[range], scratch: &mut shard.scratch };
             layer.backward(self.params(index), &self.pass(index, images.start), n, pair, dx, grads);
