@@ -164,6 +164,7 @@ pub mod pilot;
 pub mod random;
 pub mod recipe;
 pub mod report;
+pub mod serve;
 pub mod simulator;
 pub mod tensor;
 pub mod training;

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use steersman_kernels::Isa;
 
-use crate::dataset::decode::{RgbImage, decode_rgb};
+use crate::dataset::decode::{MAX_SIDE, RgbImage, decode_rgb_within};
 use crate::dataset::preprocess::Preprocessor;
 use crate::error::{Error, Result};
 use crate::model_file::Model;
@@ -80,6 +80,16 @@ impl Pilot {
         &self.model.recipe
     }
 
+    /// The network that steers.
+    pub fn network(&self) -> &Network {
+        &self.model.network
+    }
+
+    /// The numbers of the network.
+    pub fn parameters(&self) -> &Parameters {
+        &self.model.parameters
+    }
+
     /// Steering for an RGB image, `[height][width][3]`. Roughly in [−1, 1], positive to the right; not clamped.
     ///
     /// # Errors
@@ -105,8 +115,17 @@ impl Pilot {
     ///
     /// [`Error::Usage`] that says what is wrong with the image.
     pub fn steer_encoded(&mut self, bytes: &[u8]) -> Result<f32> {
+        self.steer_encoded_within(bytes, MAX_SIDE)
+    }
+
+    /// [`Pilot::steer_encoded`] for images of strangers: one that is higher or wider than `max_side` pixels is an error.
+    ///
+    /// # Errors
+    ///
+    /// As [`Pilot::steer_encoded`].
+    pub fn steer_encoded_within(&mut self, bytes: &[u8], max_side: usize) -> Result<f32> {
         let mut image = std::mem::take(&mut self.image);
-        let steering = match decode_rgb(bytes, &mut image) {
+        let steering = match decode_rgb_within(bytes, max_side, &mut image) {
             Ok(()) => self.steer(image.height, image.width, &image.pixels),
             Err(message) => Err(Error::Usage(message)),
         };

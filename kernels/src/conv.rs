@@ -14,7 +14,7 @@ mod shape;
 mod weight_gradient;
 
 use crate::Isa;
-use direct::TapSum;
+use direct::{Band, TapSum};
 use input_gradient::InputGradient;
 use prepare::Layout;
 pub use shape::ConvShape;
@@ -53,11 +53,14 @@ impl Conv {
             "convolution: every size but the padding must be at least 1 in {shape:?}"
         );
         let layout = Layout::new(shape);
+        let spans = grid::spans(shape.out_h(), shape.out_w(), layout.pitch, isa.lanes());
+        let bands = if spans.is_empty() { vec![] } else { vec![Band { spans: 0..spans.len(), taps: 0..shape.taps() }] };
         let sum = TapSum {
             taps: layout.taps(),
             weights: (0..shape.taps()).collect(),
             weight_stride: shape.taps(),
-            spans: grid::spans(shape.out_h(), shape.out_w(), layout.pitch, isa.lanes()),
+            spans,
+            bands,
             origin: 0,
             in_image: layout.image(),
             channels: shape.oc,

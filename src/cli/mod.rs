@@ -6,12 +6,15 @@
 mod bench;
 mod drive;
 mod evaluate;
+mod experiment;
 mod export;
 mod inspect;
 mod predict;
 mod progress;
 mod record;
+mod serve;
 mod share_bar;
+mod sim;
 mod summary;
 mod train;
 
@@ -42,7 +45,10 @@ enum Command {
     Train(train::TrainArgs),
     Record(record::RecordArgs),
     Drive(drive::DriveArgs),
+    Serve(serve::ServeArgs),
+    Sim(sim::SimArgs),
     Evaluate(evaluate::EvaluateArgs),
+    Experiment(experiment::ExperimentArgs),
     Predict(predict::PredictArgs),
     Export(export::ExportArgs),
     Inspect(inspect::InspectArgs),
@@ -57,7 +63,10 @@ pub fn main() -> ExitCode {
         Command::Train(args) => train::run(args),
         Command::Record(args) => record::run(args),
         Command::Drive(args) => drive::run(args),
+        Command::Serve(args) => serve::run(args),
+        Command::Sim(args) => sim::run(args),
         Command::Evaluate(args) => evaluate::run(args),
+        Command::Experiment(args) => experiment::run(args),
         Command::Predict(args) => predict::run(args),
         Command::Export(args) => export::run(args),
         Command::Inspect(args) => inspect::run(args),
@@ -116,6 +125,20 @@ fn stop_on_ctrl_c() -> Result<Arc<AtomicBool>> {
     };
     ctrlc::set_handler(handler).map_err(|e| Error::Usage(format!("cannot listen for Ctrl-C: {e}")))?;
     Ok(stop)
+}
+
+/// Refuses an output that exists already.
+fn refuse_existing(path: &Path) -> Result<()> {
+    match path.exists() {
+        true => Err(Error::Usage(format!("{}: exists already and is not overwritten; name a new one", path.display()))),
+        false => Ok(()),
+    }
+}
+
+/// Makes the new folder `path`, and those it lies in.
+fn new_folder(path: &Path) -> Result<()> {
+    refuse_existing(path)?;
+    std::fs::create_dir_all(path).map_err(Error::io(path))
 }
 
 /// Prints `text`. Whoever reads may stop before the end, as `head` does.

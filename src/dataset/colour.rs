@@ -33,6 +33,37 @@ pub enum Colour {
 }
 
 impl Colour {
+    /// All of them.
+    pub const ALL: [Colour; 8] = [
+        Colour::Rgb,
+        Colour::Yuv,
+        Colour::YuvOld,
+        Colour::Hsv,
+        Colour::Saturation,
+        Colour::Hls,
+        Colour::Lab,
+        Colour::Gray,
+    ];
+
+    /// Name in recipes.
+    pub fn name(self) -> &'static str {
+        ["rgb", "yuv", "yuv-old", "hsv", "saturation", "hls", "lab", "gray"][self as usize]
+    }
+
+    /// Names of the planes.
+    pub fn plane_names(self) -> &'static [&'static str] {
+        match self {
+            Colour::Rgb => &["red", "green", "blue"],
+            Colour::Yuv => &["Y", "U", "V"],
+            Colour::YuvOld => &["Y", "U", "V (red and blue exchanged)"],
+            Colour::Hsv => &["hue", "saturation", "value"],
+            Colour::Saturation => &["saturation"],
+            Colour::Hls => &["hue", "lightness", "saturation"],
+            Colour::Lab => &["L*", "a*", "b*"],
+            Colour::Gray => &["luminance"],
+        }
+    }
+
     /// Number of planes.
     pub fn channels(self) -> usize {
         match self {

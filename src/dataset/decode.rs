@@ -30,15 +30,23 @@ pub struct RgbImage {
 /// # Errors
 /// A short sentence that says what is wrong with the image; the caller knows its place.
 pub fn decode_rgb(bytes: &[u8], image: &mut RgbImage) -> Result<(), String> {
+    decode_rgb_within(bytes, MAX_SIDE, image)
+}
+
+/// [`decode_rgb`] for images of strangers: what is higher or wider than `max_side` pixels is not decoded.
+///
+/// # Errors
+/// As [`decode_rgb`].
+pub fn decode_rgb_within(bytes: &[u8], max_side: usize, image: &mut RgbImage) -> Result<(), String> {
     if bytes.is_empty() {
         Err("the image is empty".into())
     } else if bytes.starts_with(PNG_SIGNATURE) {
-        decode_png(bytes, image)
+        decode_png(bytes, max_side, image)
     } else if bytes.starts_with(&[0xff, 0xd8]) {
         if !ends_complete(bytes) {
             return Err("the JPEG is truncated".into());
         }
-        decode_jpeg(bytes, image)
+        decode_jpeg(bytes, max_side, image)
     } else {
         Err("neither a JPEG nor a PNG image".into())
     }
@@ -68,11 +76,11 @@ pub fn starts_as_image(head: &[u8]) -> bool {
     head.starts_with(&[0xff, 0xd8]) || head.starts_with(PNG_SIGNATURE)
 }
 
-fn decode_jpeg(bytes: &[u8], image: &mut RgbImage) -> Result<(), String> {
+fn decode_jpeg(bytes: &[u8], max_side: usize, image: &mut RgbImage) -> Result<(), String> {
     let options = DecoderOptions::default()
         .jpeg_set_out_colorspace(ColorSpace::RGB)
-        .set_max_width(MAX_SIDE)
-        .set_max_height(MAX_SIDE);
+        .set_max_width(max_side)
+        .set_max_height(max_side);
     let mut decoder = JpegDecoder::new_with_options(ZCursor::new(bytes), options);
     let failed = |error: zune_jpeg::errors::DecodeErrors| format!("the JPEG cannot be decoded: {error:?}");
     decoder.decode_headers().map_err(failed)?;
@@ -86,11 +94,11 @@ fn decode_jpeg(bytes: &[u8], image: &mut RgbImage) -> Result<(), String> {
     Ok(())
 }
 
-fn decode_png(bytes: &[u8], image: &mut RgbImage) -> Result<(), String> {
+fn decode_png(bytes: &[u8], max_side: usize, image: &mut RgbImage) -> Result<(), String> {
     let mut reader = image::ImageReader::with_format(Cursor::new(bytes), image::ImageFormat::Png);
     let mut limits = image::Limits::default();
-    limits.max_image_width = Some(MAX_SIDE as u32);
-    limits.max_image_height = Some(MAX_SIDE as u32);
+    limits.max_image_width = Some(max_side as u32);
+    limits.max_image_height = Some(max_side as u32);
     reader.limits(limits);
     let decoded = reader.decode().map_err(|error| format!("the PNG cannot be decoded: {error}"))?.into_rgb8();
     (image.height, image.width) = (decoded.height() as usize, decoded.width() as usize);
@@ -131,6 +139,19 @@ mod tests {
         assert!(error / (pixels.len() as f64) < 3.0, "mean error {}", error / pixels.len() as f64);
         assert_eq!(image_size(&jpeg), Ok([24, 40]));
         assert_eq!(image_size(&png), Ok([24, 40]));
+    }
+
+    #[test]
+    fn too_large_an_image_is_not_decoded() {
+        let mut image = RgbImage::default();
+        let jpeg = jpeg(&gradient(40, 24), 40, 24);
+        assert!(decode_rgb_within(&jpeg, 40, &mut image).is_ok());
+        assert!(decode_rgb_within(&jpeg, 39, &mut image).is_err());
+        let mut png = Vec::new();
+        let encoder = image::codecs::png::PngEncoder::new(&mut png);
+        encoder.write_image(&gradient(24, 40), 24, 40, image::ExtendedColorType::Rgb8).unwrap();
+        assert!(decode_rgb_within(&png, 40, &mut image).is_ok());
+        assert!(decode_rgb_within(&png, 39, &mut image).is_err());
     }
 
     #[test]

@@ -8,9 +8,9 @@ use std::time::Instant;
 use rayon::prelude::*;
 use serde::Serialize;
 
-use super::run::{Driver, Expert, INTERVENTION_M, Run, RunOptions, run};
+use super::run::{Driver, Expert, INTERVENTION_M, Run, RunOptions, line_errors_m, run};
 use super::speed::Speed;
-use super::statistics::{PairedTest, quantile, wilson_interval};
+use super::statistics::{PairedTest, wilson_interval};
 use super::track::Track;
 use crate::{Error, Result};
 
@@ -183,9 +183,8 @@ fn check(options: &DriveOptions) -> Result<()> {
 
 fn summarise(track: &Track, options: &DriveOptions, runs: &[RunPair]) -> DriveSummary {
     let sum = |f: &dyn Fn(&RunPair) -> f64| runs.iter().map(f).sum::<f64>();
-    let mut errors: Vec<f64> = runs.iter().flat_map(|r| &r.free.moments).map(|m| m.cte_m.abs()).collect();
-    errors.sort_by(f64::total_cmp);
-    let n = errors.len().max(1) as f64;
+    let free = || runs.iter().flat_map(|r| &r.free.moments);
+    let [cte_mean_m, cte_rms_m, cte_p95_m] = line_errors_m(free());
     let time_s = sum(&|r| r.free.time_s).max(1e-9);
     let assisted_s = sum(&|r| r.assisted.time_s).max(1e-9);
     let interventions: usize = runs.iter().map(|r| r.assisted.interventions).sum();
@@ -204,12 +203,12 @@ fn summarise(track: &Track, options: &DriveOptions, runs: &[RunPair]) -> DriveSu
         interventions,
         interventions_per_km: interventions as f64 / (sum(&|r| r.assisted.distance_m) / 1000.0).max(1e-9),
         distance_m: sum(&|r| r.free.distance_m),
-        cte_mean_m: errors.iter().sum::<f64>() / n,
-        cte_rms_m: (errors.iter().map(|e| e * e).sum::<f64>() / n).sqrt(),
-        cte_p95_m: quantile(&errors, 0.95),
+        cte_mean_m,
+        cte_rms_m,
+        cte_p95_m,
         off_road_s: sum(&|r| r.free.off_road_s),
         crashes: runs.iter().filter(|r| r.free.failure == Some(super::run::Failure::Crash)).count(),
-        mean_speed_mph: runs.iter().flat_map(|r| &r.free.moments).map(|m| m.speed_mph).sum::<f64>() / n,
+        mean_speed_mph: free().map(|m| m.speed_mph).sum::<f64>() / free().count().max(1) as f64,
         whiteness_deg_s: (sum(&|r| r.free.whiteness_sum) / time_s).sqrt(),
         expert_whiteness_deg_s: 0.0,
         realtime_factor: 0.0,

@@ -1,16 +1,13 @@
 //! One closed-loop run: a driver steers by what the camera shows, free or assisted.
 
-use std::collections::VecDeque;
-
-use super::camera::{Camera, Mount, RgbFrame};
-use super::car::{Controls, MAX_STEER_DEG, MPS_PER_MPH, STEP_S, STEPS_PER_S};
+use super::camera::RgbFrame;
+use super::car::STEP_S;
+use super::closed_loop::ClosedLoop;
 use super::expert;
-use super::jpeg::RoundTrip;
-use super::light::Variant;
-use super::noise::SteeringNoise;
-use super::renderer::Renderer;
-use super::simulation::{Simulation, Start};
-use super::speed::{Speed, SpeedController};
+use super::eye::Eye;
+use super::simulation::Simulation;
+use super::speed::{Speed, SpeedController, telemetry_mph};
+use super::statistics::quantile;
 use super::track::Track;
 use crate::Result;
 
@@ -20,16 +17,12 @@ pub const DRIVE_HZ: u64 = 20;
 pub const INTERVENTION_M: f64 = 1.0;
 /// Time charged for an intervention, s (NVIDIA 2016).
 pub const INTERVENTION_S: f64 = 6.0;
-/// Longest time with more than two wheels off the road, s.
-const OFF_ROAD_LIMIT_S: f64 = 1.0;
-/// Longest time standing still, s.
-const STANDING_LIMIT_S: f64 = 10.0;
 
 /// What a driver may know beside the picture.
 pub struct DriveState<'a> {
     /// The car on its track. A driver that is to be judged looks only at the picture and at the speed.
     pub simulation: &'a Simulation<'a>,
-    /// Speed, mph.
+    /// Speed as telemetry carries it, mph.
     pub speed_mph: f64,
 }
 
@@ -106,7 +99,7 @@ pub struct Moment {
 }
 
 /// What one run of a driver came to.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Run {
     /// Moments at 20 Hz.
     pub moments: Vec<Moment>,
@@ -133,6 +126,25 @@ impl Run {
     pub fn autonomy_percent(&self) -> f64 {
         (100.0 * (1.0 - INTERVENTION_S * self.interventions as f64 / self.time_s.max(STEP_S))).max(0.0)
     }
+
+    /// Root mean square rate of the steering, deg/s.
+    pub fn whiteness_deg_s(&self) -> f64 {
+        (self.whiteness_sum / self.time_s.max(STEP_S)).sqrt()
+    }
+
+    /// Mean speed over the moments, mph.
+    pub fn mean_speed_mph(&self) -> f64 {
+        self.moments.iter().map(|m| m.speed_mph).sum::<f64>() / self.moments.len().max(1) as f64
+    }
+}
+
+/// Distance from the line over the moments of runs: mean, root mean square and 95th percentile, m.
+pub fn line_errors_m<'a>(moments: impl Iterator<Item = &'a Moment>) -> [f64; 3] {
+    let mut errors: Vec<f64> = moments.map(|m| m.cte_m.abs()).collect();
+    errors.sort_by(f64::total_cmp);
+    let n = errors.len().max(1) as f64;
+    let rms = (errors.iter().map(|e| e * e).sum::<f64>() / n).sqrt();
+    [errors.iter().sum::<f64>() / n, rms, quantile(&errors, 0.95)]
 }
 
 /// How a run is driven.
@@ -155,122 +167,26 @@ pub struct RunOptions {
 /// # Errors
 /// If a picture cannot be encoded.
 pub fn run(track: &Track, driver: &mut dyn Driver, options: &RunOptions, seed: u64) -> Result<Run> {
-    let mut simulation = Simulation::new(track, Start::draw(track, seed), options.speed.at_start_mps());
+    let mut closed_loop = ClosedLoop::new(track, options, seed);
     let mut eye = driver.needs_frame().then(|| Eye::new(track, seed));
     let blank = RgbFrame::default();
     let mut controller = SpeedController::default();
-    let mut noise = SteeringNoise::new(seed, options.noise);
-    let latency_steps = (options.latency_ms / 1000.0 * STEPS_PER_S as f64).round() as u64;
-    // Steering on its way to the wheels: the step at which it arrives, and its value.
-    let mut pending: VecDeque<(u64, f64)> = VecDeque::new();
-    let way_m = options.laps as f64 * track.length_m;
-    let slowest_mps = 0.25 * options.speed.at_start_mps().max(2.0);
-    let most_steps = ((way_m / slowest_mps + 60.0) * STEPS_PER_S as f64) as u64;
-    let mut controls = Controls::default();
-    let (mut shown, mut frames, mut steering) = (0, 0, 0.0);
-    let (mut off_steps, mut standing_steps) = (0u64, 0u64);
-    let mut put_back = false;
-    let mut result = Run {
-        moments: Vec::new(),
-        laps_completed: 0,
-        distance_m: 0.0,
-        time_s: 0.0,
-        off_road_s: 0.0,
-        failure: None,
-        interventions: 0,
-        worst_cte_m: simulation.cte_m().abs(),
-        whiteness_sum: 0.0,
-    };
-    while simulation.progress_m < way_m && simulation.steps < most_steps && result.failure.is_none() {
-        let step = simulation.steps;
-        if step * DRIVE_HZ >= frames * STEPS_PER_S {
-            let dt_s = if frames == 0 { 1.0 / DRIVE_HZ as f64 } else { (step - shown) as f64 * STEP_S };
-            let speed_mph = simulation.car.speed_mps / MPS_PER_MPH;
+    while closed_loop.goes_on() {
+        if closed_loop.frame_is_due() {
+            let simulation = closed_loop.simulation();
+            let speed_mph = telemetry_mph(simulation.car.speed_mps);
             let frame = match &mut eye {
-                Some(eye) => eye.look(&simulation)?,
+                Some(eye) => eye.look(simulation)?,
                 None => &blank,
             };
-            let answer = f64::from(driver.steer(frame, &DriveState { simulation: &simulation, speed_mph }));
-            // A driver that answers nonsense steers straight ahead.
-            let answer = if answer.is_finite() { answer.clamp(-1.0, 1.0) } else { 0.0 };
-            if frames > 0 {
-                let change = (answer - steering) * MAX_STEER_DEG;
-                result.whiteness_sum += change * change / dt_s;
-            }
-            steering = answer;
-            pending.push_back((step + latency_steps, answer + noise.next(dt_s)));
-            controls.throttle = controller.throttle(options.speed.target_mph(&simulation), speed_mph, dt_s);
-            result.moments.push(Moment {
-                time_s: simulation.time_s(),
-                x: simulation.car.x,
-                y: simulation.car.y,
-                s_m: simulation.location.s_m,
-                cte_m: simulation.cte_m(),
-                steering,
-                throttle: controls.throttle,
-                speed_mph,
-                intervention: std::mem::take(&mut put_back),
-            });
-            (shown, frames) = (step, frames + 1);
+            let steering = driver.steer(frame, &DriveState { simulation, speed_mph });
+            let target_mph = options.speed.target_mph(simulation);
+            let throttle = controller.throttle_at(simulation.time_s(), target_mph, speed_mph);
+            closed_loop.answer(steering, throttle);
         }
-        while pending.front().is_some_and(|(at, _)| *at <= step) {
-            controls.steering = pending.pop_front().map_or(0.0, |(_, value)| value);
-        }
-        simulation.step(controls);
-
-        let off = simulation.wheels_off > 2;
-        off_steps = if off { off_steps + 1 } else { 0 };
-        standing_steps = if simulation.car.speed_mps < 0.1 { standing_steps + 1 } else { 0 };
-        result.off_road_s += if off { STEP_S } else { 0.0 };
-        result.worst_cte_m = result.worst_cte_m.max(simulation.cte_m().abs());
-        if options.assisted {
-            if simulation.cte_m().abs() > INTERVENTION_M {
-                result.interventions += 1;
-                simulation.put_back();
-                pending.clear();
-                controls.steering = 0.0;
-                put_back = true;
-            }
-        } else if simulation.at_wall {
-            result.failure = Some(Failure::Crash);
-        } else if off_steps as f64 * STEP_S > OFF_ROAD_LIMIT_S {
-            result.failure = Some(Failure::LeftRoad);
-        } else if standing_steps as f64 * STEP_S > STANDING_LIMIT_S {
-            result.failure = Some(Failure::StoodStill);
-        }
+        closed_loop.step();
     }
-    result.time_s = simulation.time_s();
-    result.distance_m = simulation.progress_m.max(0.0);
-    result.laps_completed = ((result.distance_m / track.length_m + 1e-9) as usize).min(options.laps);
-    Ok(result)
-}
-
-/// Takes the driver's pictures.
-struct Eye<'a> {
-    track: &'a Track,
-    variant: Variant,
-    renderer: Renderer,
-    frame: RgbFrame,
-    jpeg: RoundTrip,
-}
-
-impl<'a> Eye<'a> {
-    fn new(track: &'a Track, seed: u64) -> Eye<'a> {
-        Eye {
-            track,
-            variant: Variant::new(track.world(), seed),
-            renderer: Renderer::default(),
-            frame: RgbFrame::default(),
-            jpeg: RoundTrip::default(),
-        }
-    }
-
-    fn look(&mut self, simulation: &Simulation) -> Result<&RgbFrame> {
-        let camera = Camera::new(&simulation.body_pose(), Mount::Center);
-        self.renderer.render(self.track.world(), &self.variant, &camera, Mount::Center, &mut self.frame);
-        self.jpeg.apply(&mut self.frame)?;
-        Ok(&self.frame)
-    }
+    Ok(closed_loop.finish())
 }
 
 #[cfg(test)]

@@ -2,5 +2,6 @@
 #![allow(dead_code)]
 
 pub mod command;
+pub mod double;
 pub mod formula;
 pub mod painted_log;

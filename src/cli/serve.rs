@@ -1,0 +1,156 @@
+//! `steersman serve`: drives Udacity's simulator, or any client that speaks its protocol.
+
+use std::io::IsTerminal;
+use std::net::{IpAddr, SocketAddr};
+use std::path::PathBuf;
+use std::sync::Mutex;
+use std::time::{Duration, Instant};
+
+use clap::Args;
+use indicatif::{ProgressBar, ProgressStyle};
+
+use super::{or_dash, print_json, stop_on_ctrl_c};
+use crate::error::{Error, Result};
+use crate::pilot::Pilot;
+use crate::serve::{Console, HelmOptions, Server, ServerOptions, Summary, protocol};
+
+/// Drive Udacity's simulator with a model; it connects by itself in autonomous mode
+#[derive(Debug, Args)]
+pub struct ServeArgs {
+    /// Model file
+    model: PathBuf,
+    /// Speed to hold, mph
+    #[arg(long, default_value_t = 15.0, value_name = "MPH")]
+    speed: f64,
+    /// Drive slower than --speed where much steering is needed
+    #[arg(long)]
+    slower_in_bends: bool,
+    /// Smooth the steering with a low-pass filter of this time constant, ms
+    #[arg(long, default_value_t = 0.0, value_name = "MS")]
+    smooth: f64,
+    /// Port to listen at; the simulator connects to 4567. 0 takes any free one
+    #[arg(long, default_value_t = protocol::DEFAULT_PORT)]
+    port: u16,
+    /// Address to listen at; 0.0.0.0 lets other machines connect
+    #[arg(long, default_value = "127.0.0.1", value_name = "ADDRESS")]
+    host: IpAddr,
+    /// Record frames and commands in the format of the simulator; the folder must not exist
+    #[arg(long, value_name = "DIR")]
+    record: Option<PathBuf>,
+    /// Let web pages of this origin connect, as in http://localhost:8000; may be given several times
+    #[arg(long, value_name = "ORIGIN")]
+    allow_origin: Vec<String>,
+    /// Show every step of the connection and what each side sends: for a car that does not move
+    #[arg(long)]
+    check: bool,
+    /// Print one JSON object as the last line, at the end
+    #[arg(long)]
+    json: bool,
+}
+
+pub fn run(args: ServeArgs) -> Result<()> {
+    if !(1.0..=30.0).contains(&args.speed) {
+        return Err(Error::Usage(format!("--speed {}: 1 to 30 mph can be driven", args.speed)));
+    }
+    if !(0.0..=1000.0).contains(&args.smooth) {
+        return Err(Error::Usage(format!("--smooth {}: 0 to 1000 ms are meant", args.smooth)));
+    }
+    let pilot = Pilot::load(&args.model)?;
+    let server = Server::bind(ServerOptions {
+        address: SocketAddr::new(args.host, args.port),
+        helm: HelmOptions {
+            speed_mph: args.speed,
+            slower_in_bends: args.slower_in_bends,
+            smooth_s: args.smooth / 1000.0,
+        },
+        record: args.record,
+        allowed_origins: args.allow_origin,
+        check: args.check,
+    })?;
+    let stop = stop_on_ctrl_c()?;
+    let address = server.address()?;
+    eprintln!("listening on ws://{address}/socket.io/");
+    if args.port != 0 && args.port != protocol::DEFAULT_PORT {
+        eprintln!("note: Udacity's simulator connects to port {} by itself", protocol::DEFAULT_PORT);
+    }
+    if !args.host.is_loopback() {
+        eprintln!("note: whoever reaches {address} can connect; there is no password");
+    }
+    let screen = Screen::new();
+    let summary = server.run(pilot, &screen, &stop)?;
+    screen.close();
+    if args.json {
+        return print_json(&summary);
+    }
+    print_summary(&summary);
+    Ok(())
+}
+
+fn print_summary(summary: &Summary) {
+    println!("frames answered            {}", summary.frames);
+    println!("time                       {:.1} s", summary.seconds);
+    println!("frames/s                   {}", or_dash(summary.frames_per_second, 1));
+    println!(
+        "latency p50/p99/longest    {} / {} / {} ms",
+        or_dash(summary.latency_p50_ms, 2),
+        or_dash(summary.latency_p99_ms, 2),
+        or_dash(summary.latency_max_ms, 2)
+    );
+    println!("superseded frames          {}", summary.superseded);
+    println!("connections                {}", summary.connections);
+    if let Some(recorded) = &summary.recorded {
+        match recorded.rows {
+            0 => println!("recorded                   nothing"),
+            rows => println!("recorded                   {rows} rows in {}", recorded.folder.display()),
+        }
+        if recorded.dropped > 0 {
+            println!("not recorded               {} rows: the disk was too slow", recorded.dropped);
+        }
+    }
+}
+
+/// Standard error: on a terminal the status stays in the last line, elsewhere it is written now and then.
+struct Screen {
+    bar: Option<ProgressBar>,
+    last_plain: Mutex<Option<Instant>>,
+}
+
+impl Screen {
+    /// Time between plain status lines.
+    const PLAIN_INTERVAL: Duration = Duration::from_secs(10);
+
+    fn new() -> Screen {
+        let style = ProgressStyle::with_template("{msg}").expect("the template is valid");
+        let bar = std::io::stderr().is_terminal().then(|| ProgressBar::new_spinner().with_style(style));
+        Screen { bar, last_plain: Mutex::new(None) }
+    }
+
+    fn close(&self) {
+        if let Some(bar) = &self.bar {
+            bar.finish_and_clear();
+        }
+    }
+}
+
+impl Console for Screen {
+    fn line(&self, text: &str) {
+        match &self.bar {
+            Some(bar) => bar.suspend(|| eprintln!("{text}")),
+            None => eprintln!("{text}"),
+        }
+    }
+
+    fn status(&self, text: &str) {
+        if let Some(bar) = &self.bar {
+            bar.set_message(text.to_owned());
+            bar.tick();
+            return;
+        }
+        // A thread that panicked while printing is no reason to lose the line.
+        let mut last = self.last_plain.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
+        if last.is_none_or(|last| last.elapsed() >= Self::PLAIN_INTERVAL) {
+            *last = Some(Instant::now());
+            eprintln!("{text}");
+        }
+    }
+}

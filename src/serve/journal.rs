@@ -1,0 +1,207 @@
+//! What is told to the person at the keyboard: what happened, what is wrong, and what to do about it.
+
+use std::collections::BTreeMap;
+use std::sync::{Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+use serde::Serialize;
+
+use super::server::Console;
+
+/// Lines about the same thing come no closer than this.
+const INTERVAL: Duration = Duration::from_secs(5);
+
+/// Something that is reported. Each has its own sentence with the remedy, and is repeated only now and then.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Event {
+    /// A client connected.
+    Connected,
+    /// A client left.
+    Disconnected,
+    /// A client drives from now on.
+    Drives,
+    /// Nobody has connected.
+    NobodyConnects,
+    /// A request was refused.
+    Refused,
+    /// More connections than are kept.
+    TooManyConnections,
+    /// A client was too slow.
+    TooSlow,
+    /// Bytes that are no WebSocket frames, or frames that are too large.
+    BrokenFrames,
+    /// A message that is no Socket.IO.
+    NotSocketIo,
+    /// The browser version's protocol.
+    PlainJson,
+    /// An event with broken JSON.
+    BrokenEvent,
+    /// Connected, but no telemetry.
+    NoTelemetry,
+    /// Telemetry stopped.
+    Stale,
+    /// Telemetry without a picture.
+    NoImage,
+    /// Telemetry without a speed.
+    NoSpeed,
+    /// A picture that cannot be read.
+    UnreadableImage,
+    /// Another client drives.
+    SeatTaken,
+    /// Numbers with another decimal mark than a point.
+    DecimalMark,
+    /// A simulator of the second term.
+    SecondTerm,
+    /// A person drives.
+    Override,
+    /// The car ignores the throttle.
+    ThrottleIgnored,
+    /// A row could not be recorded in time.
+    RecordingLags,
+    /// A namespace other than `/`.
+    Namespace,
+    /// This program failed.
+    Fault,
+}
+
+impl Event {
+    /// What it means and what to do, if anything.
+    fn remedy(self) -> Option<&'static str> {
+        Some(match self {
+            Event::Connected | Event::Disconnected | Event::Drives | Event::Refused => return None,
+            Event::NobodyConnects => {
+                "start the simulator on this machine and choose a track in AUTONOMOUS MODE; it connects to port 4567 of \
+                 127.0.0.1 by itself. For a simulator on another machine or in a container give --host 0.0.0.0"
+            }
+            Event::TooManyConnections => "the oldest that does not drive is closed",
+            Event::TooSlow => "closed; whoever connects has to send telemetry",
+            Event::BrokenFrames => "closed; is this a WebSocket client, and is an image below 700 KB?",
+            Event::NotSocketIo => "a Socket.IO client is expected, such as Udacity's simulator",
+            Event::PlainJson => {
+                "that is the protocol of the browser version of the simulator; use the desktop build, version 2 of 2/07/17 \
+                 or later"
+            }
+            Event::BrokenEvent => {
+                "expected is 42[\"telemetry\",{\"steering_angle\":…,\"throttle\":…,\"speed\":…,\"image\":…}]"
+            }
+            Event::NoTelemetry => {
+                "choose AUTONOMOUS MODE (not TRAINING MODE); in the simulator's window no key may be held; builds before \
+                 version 2 of 2/07/17 speak another protocol"
+            }
+            Event::Stale => {
+                "the throttle is cut and telemetry asked for; is the simulator's window minimised, in a menu, or its machine \
+                 overloaded?"
+            }
+            Event::NoImage => "the throttle is cut; use a simulator with a front camera",
+            Event::NoSpeed => "the throttle is cut; the field `speed` in mph is needed to hold a speed",
+            Event::UnreadableImage => {
+                "the throttle is cut; a JPEG or PNG of at most 1920x1920 pixels in base64 is expected"
+            }
+            Event::SeatTaken => "it waits until that one leaves or is silent for more than 1 s",
+            Event::DecimalMark => "commands are written in the same way, no change of the language is needed",
+            Event::SecondTerm => "it gets numbers instead of strings",
+            Event::Override => "release W and S to let the model drive",
+            Event::ThrottleIgnored => {
+                "is this the car's camera view with no key held? Other programs on port 4567 can answer in between: close them"
+            }
+            Event::RecordingLags => "the disk is too slow; frames are left out of the recording",
+            Event::Fault => "please report it with what was sent",
+            Event::Namespace => "connect without a namespace",
+        })
+    }
+}
+
+/// The log.
+pub struct Journal<'a> {
+    console: &'a dyn Console,
+    check: bool,
+    entries: Mutex<BTreeMap<Event, Entry>>,
+}
+
+#[derive(Debug, Default)]
+struct Entry {
+    count: u64,
+    silent: u64,
+    last: Option<Instant>,
+}
+
+impl<'a> Journal<'a> {
+    /// A log that is shown on `console`; with `check` every step and message as well.
+    pub fn new(console: &'a dyn Console, check: bool) -> Journal<'a> {
+        Journal { console, check, entries: Mutex::default() }
+    }
+
+    /// Reports `event`: `detail`, and the remedy. Not more often than every few seconds for each kind of event.
+    pub fn report(&self, event: Event, detail: std::fmt::Arguments) {
+        let now = Instant::now();
+        let silent = {
+            let mut entries = self.entries.lock().unwrap_or_else(PoisonError::into_inner);
+            let entry = entries.entry(event).or_default();
+            entry.count += 1;
+            if entry.last.is_some_and(|last| now.duration_since(last) < INTERVAL) {
+                entry.silent += 1;
+                return;
+            }
+            entry.last = Some(now);
+            std::mem::take(&mut entry.silent)
+        };
+        let more = match silent {
+            0 => String::new(),
+            more => format!(" ({more} more like this before)"),
+        };
+        match event.remedy() {
+            Some(remedy) => self.console.line(&format!("{detail}: {remedy}{more}")),
+            None => self.console.line(&format!("{detail}{more}")),
+        }
+    }
+
+    /// Shows a step of a connection, if every step is wanted.
+    pub fn step(&self, text: std::fmt::Arguments) {
+        if self.check {
+            self.console.line(&text.to_string());
+        }
+    }
+
+    /// Whether every step is wanted.
+    pub fn checks(&self) -> bool {
+        self.check
+    }
+
+    /// How often each event happened.
+    pub fn counts(&self) -> BTreeMap<Event, u64> {
+        let entries = self.entries.lock().unwrap_or_else(PoisonError::into_inner);
+        entries.iter().map(|(event, entry)| (*event, entry.count)).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[derive(Default)]
+    struct Lines(Mutex<Vec<String>>);
+
+    impl Console for Lines {
+        fn line(&self, text: &str) {
+            self.0.lock().unwrap().push(text.into());
+        }
+
+        fn status(&self, _: &str) {}
+    }
+
+    #[test]
+    fn a_flood_of_one_event_is_one_line_and_hides_no_other() {
+        let lines = Lines::default();
+        let journal = Journal::new(&lines, false);
+        for k in 0..1000 {
+            journal.report(Event::UnreadableImage, format_args!("picture {k}"));
+        }
+        journal.report(Event::NoSpeed, format_args!("telemetry without a speed"));
+        journal.step(format_args!("not shown"));
+        let lines = lines.0.lock().unwrap();
+        assert_eq!(lines.len(), 2, "{lines:?}");
+        assert!(lines[0].starts_with("picture 0: the throttle is cut"), "{lines:?}");
+        assert_eq!(journal.counts()[&Event::UnreadableImage], 1000);
+    }
+}

@@ -1,0 +1,238 @@
+//! Recording while driving: what the camera saw and what was answered, in the format of Udacity's simulator.
+//!
+//! The log has the seven columns of the original; left and right stay empty, because telemetry has one camera. Pictures are
+//! the bytes that came, not encoded again. Another thread writes, so that a slow disk costs rows and no time.
+
+use std::fs::{self, File};
+use std::io::{BufWriter, Write as _};
+use std::path::{Path, PathBuf};
+use std::sync::Mutex;
+use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
+use std::thread::JoinHandle;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+
+use time::OffsetDateTime;
+
+use super::helm::Clock;
+use super::protocol::Command;
+use crate::error::{Error, Result};
+use crate::simulator::recorder::create_new_folder;
+
+/// Rows on their way to the disk; a second or two of driving.
+const QUEUE: usize = 64;
+
+/// One answered frame.
+#[derive(Debug)]
+pub struct Row {
+    /// When it was taken, ms since 1970.
+    pub time_ms: u64,
+    /// The picture, encoded.
+    pub image: Vec<u8>,
+    /// The answer.
+    pub command: Command,
+    /// Speed, mph.
+    pub speed_mph: f64,
+}
+
+/// What became of a recording.
+#[derive(Clone, Debug, PartialEq, Eq, serde::Serialize)]
+pub struct Recorded {
+    /// The folder.
+    pub folder: PathBuf,
+    /// Rows written.
+    pub rows: u64,
+    /// Rows left out because the disk was too slow.
+    pub dropped: u64,
+}
+
+/// A recording that goes on.
+#[derive(Debug)]
+pub struct Recorder {
+    folder: PathBuf,
+    sender: SyncSender<Row>,
+    writer: JoinHandle<Result<u64>>,
+    state: Mutex<State>,
+}
+
+#[derive(Debug)]
+struct State {
+    dropped: u64,
+    last_ms: u64,
+    /// Where simulated time 0 lies, ms since 1970.
+    simulated_from_ms: u64,
+}
+
+/// Whether a row is on its way.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Queued {
+    /// It will be written.
+    Yes,
+    /// The disk is too slow: it is left out.
+    Dropped,
+    /// Nothing can be written any more; [`Recorder::finish`] says why.
+    Failed,
+}
+
+impl Recorder {
+    /// Begins a recording in the new folder `folder`.
+    ///
+    /// # Errors
+    ///
+    /// If the folder exists or cannot be written.
+    pub fn start(folder: &Path) -> Result<Recorder> {
+        create_new_folder(folder)?;
+        let images = folder.join("IMG");
+        fs::create_dir(&images).map_err(Error::io(&images))?;
+        let log = folder.join("driving_log.csv");
+        let file = BufWriter::new(File::create_new(&log).map_err(Error::io(&log))?);
+        let (sender, receiver) = sync_channel(QUEUE);
+        let thread = std::thread::Builder::new().name("recording".into());
+        let writer = thread.spawn(move || write(&images, &log, file, &receiver)).map_err(Error::io(folder))?;
+        let state = State { dropped: 0, last_ms: 0, simulated_from_ms: now_ms() };
+        Ok(Recorder { folder: folder.into(), sender, writer, state: Mutex::new(state) })
+    }
+
+    /// Hands a row to the writer; `image` is copied. Never waits.
+    pub fn push(&self, clock: Clock, image: &[u8], command: Command, speed_mph: f64) -> Queued {
+        let mut state = self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        let taken_ms = match clock {
+            Clock::Arrival(_) => now_ms(),
+            Clock::Simulated(time_s) => state.simulated_from_ms.saturating_add((time_s.max(0.0) * 1e3).round() as u64),
+        };
+        // Names must differ, and the order of the rows is that of the frames.
+        let time_ms = taken_ms.clamp(state.last_ms + 1, state.last_ms.max(now_ms()) + 24 * 3_600_000);
+        let row = Row { time_ms, image: image.to_vec(), command, speed_mph };
+        match self.sender.try_send(row) {
+            Ok(()) => {
+                state.last_ms = time_ms;
+                Queued::Yes
+            }
+            Err(TrySendError::Full(_)) => {
+                state.dropped += 1;
+                Queued::Dropped
+            }
+            Err(TrySendError::Disconnected(_)) => Queued::Failed,
+        }
+    }
+
+    /// Waits until all is written. A recording without a row is removed.
+    ///
+    /// # Errors
+    ///
+    /// What went wrong while writing; what was written stays.
+    pub fn finish(self) -> Result<Recorded> {
+        let Recorder { folder, sender, writer, state } = self;
+        drop(sender);
+        let rows = writer
+            .join()
+            .map_err(|_| Error::Usage("the recording ended early by a fault of this program".into()))??;
+        let dropped = state.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner).dropped;
+        if rows == 0 {
+            // Only files of this recording can be in there: the folder was new.
+            fs::remove_dir_all(&folder).map_err(Error::io(&folder))?;
+        }
+        Ok(Recorded { folder, rows, dropped })
+    }
+}
+
+fn now_ms() -> u64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or(Duration::ZERO).as_millis() as u64
+}
+
+/// Writes rows until there are no more; returns their number. A row is in the log only once its picture is on the disk.
+fn write(images: &Path, log: &Path, mut file: BufWriter<File>, rows: &Receiver<Row>) -> Result<u64> {
+    let mut written = 0;
+    writeln!(file, "center,left,right,steering,throttle,brake,speed").map_err(Error::io(log))?;
+    while let Ok(row) = rows.recv() {
+        let name = image_name(row.time_ms);
+        let path = images.join(&name);
+        fs::write(&path, &row.image).map_err(Error::io(&path))?;
+        let Command { steering, throttle } = row.command;
+        let (accelerator, brake, speed) = (throttle.max(0.0), (-throttle).max(0.0), row.speed_mph as f32);
+        writeln!(file, "IMG/{name}, , , {steering}, {accelerator}, {brake}, {speed}")
+            .and_then(|()| file.flush())
+            .map_err(Error::io(log))?;
+        written += 1;
+    }
+    Ok(written)
+}
+
+/// Name of a picture taken `time_ms` after 1970, UTC.
+fn image_name(time_ms: u64) -> String {
+    let time = i64::try_from(time_ms / 1000).ok().and_then(|s| OffsetDateTime::from_unix_timestamp(s).ok());
+    let time = time.unwrap_or(OffsetDateTime::UNIX_EPOCH);
+    format!(
+        "center_{:04}_{:02}_{:02}_{:02}_{:02}_{:02}_{:03}.jpg",
+        time.year(),
+        u8::from(time.month()),
+        time.day(),
+        time.hour(),
+        time.minute(),
+        time.second(),
+        time_ms % 1000
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::time::Instant;
+
+    use crate::dataset;
+    use crate::simulator::{RgbFrame, jpeg};
+
+    fn image() -> Vec<u8> {
+        let mut bytes = Vec::new();
+        jpeg::encode(&RgbFrame::default(), &mut bytes).unwrap();
+        bytes
+    }
+
+    #[test]
+    fn names_carry_the_time_in_utc() {
+        assert_eq!(image_name(0), "center_1970_01_01_00_00_00_000.jpg");
+        // `date -u -d @1709210096` is 2024-02-29 12:34:56.
+        assert_eq!(image_name(1_709_210_096_789), "center_2024_02_29_12_34_56_789.jpg");
+        assert_eq!(image_name(u64::MAX), "center_1970_01_01_00_00_00_615.jpg");
+    }
+
+    #[test]
+    fn a_recording_is_read_back_as_it_was_driven() {
+        let scratch = tempfile::tempdir().unwrap();
+        let folder = scratch.path().join("drive");
+        let recorder = Recorder::start(&folder).unwrap();
+        let image = image();
+        for frame in 0..20 {
+            let command = Command { steering: frame as f32 / 20.0 - 0.5, throttle: frame as f32 / 10.0 - 1.0 };
+            let queued = recorder.push(Clock::Simulated(f64::from(frame) * 0.06), &image, command, 12.5);
+            assert_eq!(queued, Queued::Yes);
+        }
+        let recorded = recorder.finish().unwrap();
+        assert_eq!((recorded.rows, recorded.dropped), (20, 0));
+        let recording = dataset::load(&folder).unwrap();
+        assert_eq!((recording.rows.len(), recording.sessions.len()), (20, 1));
+        let row = &recording.rows[4];
+        assert_eq!((row.steering, row.throttle, row.brake, row.speed_mph), (-0.3, 0.0, 0.6, 12.5));
+        assert!(Recorder::start(&folder).is_err(), "an existing folder is refused");
+        assert_eq!(dataset::load(&folder).unwrap().rows.len(), 20);
+    }
+
+    #[test]
+    fn frames_of_one_millisecond_get_names_of_their_own() {
+        let scratch = tempfile::tempdir().unwrap();
+        let folder = scratch.path().join("drive");
+        let recorder = Recorder::start(&folder).unwrap();
+        let now = Clock::Arrival(Instant::now());
+        let queued = (0..30).filter(|_| recorder.push(now, b"x", Command::default(), 0.0) == Queued::Yes).count();
+        let recorded = recorder.finish().unwrap();
+        assert_eq!(recorded.rows, queued as u64);
+        assert_eq!(fs::read_dir(folder.join("IMG")).unwrap().count(), queued);
+    }
+
+    #[test]
+    fn nothing_recorded_leaves_nothing_behind() {
+        let scratch = tempfile::tempdir().unwrap();
+        let folder = scratch.path().join("drive");
+        assert_eq!(Recorder::start(&folder).unwrap().finish().unwrap().rows, 0);
+        assert!(!folder.exists());
+    }
+}

@@ -1,0 +1,116 @@
+//! Who drives: one connection at a time.
+
+use std::net::{Shutdown, TcpStream};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+/// A driver that has been silent for longer can be relieved.
+pub const SILENCE: Duration = Duration::from_secs(1);
+
+/// The driver's seat.
+#[derive(Debug, Default)]
+pub struct Seat(Mutex<Option<Holder>>);
+
+#[derive(Debug)]
+struct Holder {
+    id: u64,
+    heard: Instant,
+    stream: Arc<TcpStream>,
+}
+
+/// The answer to a claim.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Claim {
+    /// The claimant sat there already.
+    Kept,
+    /// The claimant drives from now on.
+    Taken,
+    /// Another drives.
+    Refused,
+}
+
+impl Seat {
+    /// Whether a claim of `id` would succeed at `now`.
+    pub fn is_open_to(&self, id: u64, now: Instant) -> bool {
+        self.lock().as_ref().is_none_or(|holder| holder.admits(id, now))
+    }
+
+    /// Claims the seat at `now` for `id`, which has just shown a complete state of its car. A holder that was silent for
+    /// too long loses it, and its connection is closed.
+    pub fn claim(&self, id: u64, stream: &Arc<TcpStream>, now: Instant) -> Claim {
+        let mut seat = self.lock();
+        match &mut *seat {
+            Some(holder) if holder.id == id => {
+                holder.heard = now;
+                Claim::Kept
+            }
+            Some(holder) if !holder.admits(id, now) => Claim::Refused,
+            other => {
+                if let Some(holder) = other {
+                    // It may be closed already.
+                    let _ = holder.stream.shutdown(Shutdown::Both);
+                }
+                *other = Some(Holder { id, heard: now, stream: stream.clone() });
+                Claim::Taken
+            }
+        }
+    }
+
+    /// Whether `id` sits there; if so it was heard of at `now`.
+    pub fn is_held_by(&self, id: u64, now: Instant) -> bool {
+        match &mut *self.lock() {
+            Some(holder) if holder.id == id => {
+                holder.heard = now;
+                true
+            }
+            _ => false,
+        }
+    }
+
+    /// Leaves the seat, if `id` has it.
+    pub fn leave(&self, id: u64) {
+        let mut seat = self.lock();
+        if seat.as_ref().is_some_and(|holder| holder.id == id) {
+            *seat = None;
+        }
+    }
+
+    fn lock(&self) -> std::sync::MutexGuard<'_, Option<Holder>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Holder {
+    fn admits(&self, id: u64, now: Instant) -> bool {
+        self.id == id || now.duration_since(self.heard) > SILENCE
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::io::Read;
+    use std::net::TcpListener;
+
+    #[test]
+    fn only_a_silent_driver_is_relieved_and_its_connection_closed() {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let mut client = TcpStream::connect(listener.local_addr().unwrap()).unwrap();
+        let first = Arc::new(listener.accept().unwrap().0);
+        let second = Arc::new(TcpStream::connect(listener.local_addr().unwrap()).unwrap());
+        let (seat, now) = (Seat::default(), Instant::now());
+        assert!(seat.is_open_to(2, now));
+        assert_eq!(seat.claim(1, &first, now), Claim::Taken);
+        assert_eq!(seat.claim(1, &first, now + SILENCE), Claim::Kept);
+        assert!(!seat.is_open_to(2, now + 2 * SILENCE));
+        assert_eq!(seat.claim(2, &second, now + 2 * SILENCE), Claim::Refused);
+        let later = now + 2 * SILENCE + Duration::from_millis(1);
+        assert_eq!(seat.claim(2, &second, later), Claim::Taken);
+        assert_eq!(client.read(&mut [0; 8]).unwrap(), 0, "the first connection is closed");
+        assert!(!seat.is_held_by(1, later) && seat.is_held_by(2, later));
+        seat.leave(1);
+        assert!(seat.is_held_by(2, later));
+        seat.leave(2);
+        assert_eq!(seat.claim(3, &first, later), Claim::Taken);
+    }
+}

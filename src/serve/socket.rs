@@ -1,0 +1,93 @@
+//! A TCP connection that knows when its last byte came, and comes back to its owner at a steady beat.
+
+use std::io::{self, Read, Write};
+use std::net::TcpStream;
+use std::time::{Duration, Instant};
+
+/// Longest time that sending may block: a client that does not read is given up.
+const WRITE_TIMEOUT: Duration = Duration::from_secs(1);
+
+/// A connection's stream. Reading returns `WouldBlock` once in each beat, however slowly bytes trickle in, so that whoever
+/// reads can look after its deadlines.
+#[derive(Debug)]
+pub(super) struct Socket {
+    stream: TcpStream,
+    last_byte: Instant,
+    beat: Duration,
+    beat_began: Instant,
+    waiting: bool,
+}
+
+impl Socket {
+    /// Takes over a connection that was just accepted.
+    pub fn new(stream: TcpStream, beat: Duration) -> io::Result<Socket> {
+        stream.set_nonblocking(false)?;
+        stream.set_nodelay(true)?;
+        stream.set_write_timeout(Some(WRITE_TIMEOUT))?;
+        stream.set_read_timeout(Some(beat))?;
+        let now = Instant::now();
+        Ok(Socket { stream, last_byte: now, beat, beat_began: now, waiting: true })
+    }
+
+    /// When the last byte came.
+    pub fn last_byte(&self) -> Instant {
+        self.last_byte
+    }
+
+    /// Changes the beat.
+    pub fn set_beat(&mut self, beat: Duration) -> io::Result<()> {
+        if beat != self.beat {
+            self.stream.set_read_timeout(Some(beat))?;
+            self.beat = beat;
+        }
+        Ok(())
+    }
+
+    /// Begins a beat.
+    pub fn begin_beat(&mut self) {
+        self.beat_began = Instant::now();
+    }
+
+    /// Whether reading waits for bytes.
+    pub fn set_waiting(&mut self, waiting: bool) -> io::Result<()> {
+        if waiting != self.waiting {
+            self.stream.set_nonblocking(!waiting)?;
+            self.waiting = waiting;
+        }
+        Ok(())
+    }
+
+    /// Acknowledges what has come at once. The simulator sends a message in pieces and waits for the acknowledgement of one
+    /// before it sends the last (Nagle's algorithm), which the system would otherwise delay by up to 40 ms.
+    #[cfg(target_os = "linux")]
+    fn acknowledge(&self) {
+        use std::os::linux::net::TcpStreamExt;
+        // Without it, driving goes on with the delay.
+        let _ = self.stream.set_quickack(true);
+    }
+
+    #[cfg(not(target_os = "linux"))]
+    fn acknowledge(&self) {}
+}
+
+impl Read for Socket {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        if self.waiting && self.beat_began.elapsed() >= self.beat {
+            return Err(io::ErrorKind::WouldBlock.into());
+        }
+        let len = self.stream.read(buffer)?;
+        self.last_byte = Instant::now();
+        self.acknowledge();
+        Ok(len)
+    }
+}
+
+impl Write for Socket {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.stream.write(bytes)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.stream.flush()
+    }
+}
