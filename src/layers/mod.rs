@@ -32,10 +32,11 @@ pub mod gradcheck;
 mod pool;
 mod prelu;
 mod scale;
+mod zero_pad;
 
 use std::fmt::Debug;
 
-pub use activation::{Elu, Relu};
+pub use activation::{Elu, LeakyRelu, Relu, Softsign, Tanh};
 pub use batch_norm::BatchNorm;
 pub use conv2d::{Conv2d, Padding};
 pub use crop::Crop;
@@ -45,6 +46,7 @@ pub use flatten::Flatten;
 pub use pool::{AveragePool, MaxPool};
 pub use prelu::{PRelu, Slopes};
 pub use scale::Scale;
+pub use zero_pad::ZeroPad;
 
 use crate::tensor::{Fans, Initializer, Shape};
 
