@@ -68,8 +68,23 @@ fn equal_tensors(a: &Model, b: &Model) -> Vec<String> {
 fn frozen_layers_and_their_statistics_stay_and_the_others_learn() {
     let folder = folder_with_model();
     let dir = folder.path();
-    let output =
-        run(dir, &["train", "other", "--from", FROM, "--freeze", "conv1,bn1", "--freeze", "dense1", "--out", "second"]);
+    let output = run(
+        dir,
+        &[
+            "train",
+            "other",
+            "--set",
+            "split.validation_share=0",
+            "--from",
+            FROM,
+            "--freeze",
+            "conv1,bn1",
+            "--freeze",
+            "dense1",
+            "--out",
+            "second",
+        ],
+    );
     let notices = String::from_utf8(output.stderr).unwrap();
     assert!(
         notices.contains(
@@ -132,7 +147,19 @@ fn layers_of_another_shape_begin_afresh() {
 fn a_run_goes_on_from_its_own_copy_of_the_model_to_the_same_bits() {
     let folder = folder_with_model();
     let dir = folder.path();
-    let args = ["train", "other", "--from", FROM, "--freeze", "bn1", "--out", "whole", "--json"];
+    let args = [
+        "train",
+        "other",
+        "--set",
+        "split.validation_share=0",
+        "--from",
+        FROM,
+        "--freeze",
+        "bn1",
+        "--out",
+        "whole",
+        "--json",
+    ];
     let whole = json(dir, &args);
     // As if it had been killed before the end of its first epoch, and the first model were gone.
     for file in ["result.json", "model.safetensors", "last.safetensors", "checkpoint.safetensors", "history.csv"] {

@@ -44,6 +44,11 @@ pub(crate) enum Op {
     Elu {
         alpha: f32,
     },
+    LeakyRelu {
+        slope: f32,
+    },
+    Tanh,
+    Softsign,
     /// One slope for every element of the map, or one for each channel.
     PRelu {
         slopes: Vec<f32>,
@@ -58,6 +63,11 @@ pub(crate) enum Op {
     },
     /// The output is the window of the input that begins at this row and column.
     Crop {
+        top: usize,
+        left: usize,
+    },
+    /// The input lies in the output from this row and column on, with zeros around.
+    ZeroPad {
         top: usize,
         left: usize,
     },
@@ -107,6 +117,9 @@ fn op(layer: &NamedLayer, parameters: &Parameters) -> Option<Op> {
         }
         LayerSpec::Relu {} => Op::Relu,
         LayerSpec::Elu { alpha } => Op::Elu { alpha },
+        LayerSpec::LeakyRelu { slope } => Op::LeakyRelu { slope },
+        LayerSpec::Tanh {} => Op::Tanh,
+        LayerSpec::Softsign {} => Op::Softsign,
         LayerSpec::PRelu { .. } => Op::PRelu { slopes: params.to_vec() },
         LayerSpec::MaxPool { window, stride } => Op::MaxPool { window, stride: stride.unwrap_or(window) },
         LayerSpec::AveragePool { window, stride } => Op::AveragePool { window, stride: stride.unwrap_or(window) },
@@ -117,6 +130,7 @@ fn op(layer: &NamedLayer, parameters: &Parameters) -> Option<Op> {
             Op::Dense { weight, bias }
         }
         LayerSpec::Scale { factor, offset } => Op::Scale { factor, offset },
+        LayerSpec::ZeroPad { rows: [top, _], columns: [left, _] } => Op::ZeroPad { top, left },
         LayerSpec::Crop { rows: [top, _], columns: [left, _] } => Op::Crop { top, left },
     })
 }

@@ -107,7 +107,9 @@ fn network(graph: &mut GraphBuilder, steps: &[Step], input: &str, output: &str) 
     let mut is_map = true;
     for step in steps {
         let takes = match step.op {
-            Op::Conv { .. } | Op::MaxPool { .. } | Op::AveragePool { .. } | Op::Crop { .. } => Some(true),
+            Op::Conv { .. } | Op::MaxPool { .. } | Op::AveragePool { .. } | Op::Crop { .. } | Op::ZeroPad { .. } => {
+                Some(true)
+            }
             Op::Dense { .. } | Op::Flatten => Some(false),
             _ => None,
         };
@@ -163,6 +165,9 @@ fn operation(graph: &mut GraphBuilder, step: &Step, x: &str, is_map: bool) -> St
         }
         Op::Relu => graph.node("Relu", name, &[x], vec![]),
         Op::Elu { alpha } => graph.node("Elu", name, &[x], vec![float("alpha", *alpha)]),
+        Op::LeakyRelu { slope } => graph.node("LeakyRelu", name, &[x], vec![float("alpha", *slope)]),
+        Op::Tanh => graph.node("Tanh", name, &[x], vec![]),
+        Op::Softsign => graph.node("Softsign", name, &[x], vec![]),
         Op::PRelu { slopes } => {
             // The slopes are broadcast from the right.
             let dims: &[usize] = match (is_map, slopes.len() == input.len()) {
@@ -185,6 +190,82 @@ fn operation(graph: &mut GraphBuilder, step: &Step, x: &str, is_map: bool) -> St
             let axes = graph.int64s(&constant("axes"), &[2, 3]);
             graph.node("Slice", name, &[x, &starts, &ends, &axes], vec![])
         }
+        Op::ZeroPad { top, left } => {
+            let (bottom, right) = (output.h - input.h - top, output.w - input.w - left);
+            let pads = graph.int64s(&constant("pads"), &[0, 0, *top, *left, 0, 0, bottom, right]);
+            graph.node("Pad", name, &[x, &pads], vec![])
+        }
         Op::Flatten => x.into(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::HashSet;
+
+    use super::proto::GraphProto;
+    use super::*;
+    use crate::model_file::TrainingRecord;
+    use crate::recipe::{Recipe, SHIPPED};
+
+    fn model(name: &str) -> Model {
+        let recipe = Recipe::find(name, &[]).unwrap();
+        let parameters = recipe.network(Isa::PORTABLE).unwrap().initialize(1);
+        Model { recipe, parameters, record: TrainingRecord::default(), training_rows: vec![] }
+    }
+
+    fn decode(name: &str, options: OnnxOptions) -> (ModelProto, GraphProto) {
+        let decoded = ModelProto::decode(onnx(&model(name), options).unwrap().as_slice()).unwrap();
+        let graph = decoded.graph.clone().unwrap();
+        (decoded, graph)
+    }
+
+    #[test]
+    fn every_value_is_made_once_and_before_it_is_used() {
+        for (name, _) in SHIPPED {
+            for (with_preprocessing, fold_batch_norm) in [(false, false), (true, false), (true, true)] {
+                let (_, graph) = decode(name, OnnxOptions { with_preprocessing, fold_batch_norm });
+                let inputs = graph.input.iter().map(|input| input.name.as_str());
+                let mut known: HashSet<&str> = inputs.collect();
+                for constant in &graph.initializer {
+                    assert!(known.insert(&constant.name), "{name}: {} twice", constant.name);
+                }
+                for node in &graph.node {
+                    assert!(node.input.iter().all(|input| known.contains(input.as_str())), "{name}: {node:?}");
+                    assert!(node.output.iter().all(|output| known.insert(output)), "{name}: {node:?}");
+                }
+                assert!(known.contains("steering"), "{name}");
+            }
+        }
+    }
+
+    #[test]
+    fn inputs_are_as_asked_for_and_the_batch_is_free() {
+        for (with_preprocessing, expected) in [(false, vec![3, 40, 160]), (true, vec![160, 320, 3])] {
+            let (_, graph) = decode("hyper", OnnxOptions { with_preprocessing, fold_batch_norm: false });
+            let tensor = graph.input[0].r#type.clone().unwrap().tensor_type.unwrap();
+            let dims = tensor.shape.unwrap().dim;
+            assert_eq!(dims[0].dim_param.as_deref(), Some("N"));
+            assert_eq!(dims[1..].iter().map(|dim| dim.dim_value.unwrap()).collect::<Vec<_>>(), expected);
+        }
+    }
+
+    #[test]
+    fn batch_norm_is_folded_only_when_asked_for() {
+        let count = |fold_batch_norm| {
+            let (_, graph) = decode("hyper", OnnxOptions { with_preprocessing: false, fold_batch_norm });
+            graph.node.iter().filter(|node| node.op_type == "BatchNormalization").count()
+        };
+        assert_eq!((count(false), count(true)), (6, 0));
+    }
+
+    #[test]
+    fn the_metadata_says_how_to_use_it() {
+        let (decoded, _) = decode("lenet", OnnxOptions::default());
+        let entry = |key: &str| decoded.metadata_props.iter().find(|entry| entry.key == key).unwrap().value.clone();
+        assert_eq!(entry("full_lock_deg"), "25");
+        assert!(entry("label").contains("positive to the right"));
+        assert_eq!(Recipe::parse("metadata", &entry("recipe"), &[]).unwrap(), model("lenet").recipe);
+        assert_eq!(decoded.opset_import[0].version, OPSET);
     }
 }

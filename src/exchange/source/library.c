@@ -316,6 +316,24 @@ static void crop(const float *x, float *y, struct crop s) {
     }
 }
 
+/* == zero_pad */
+struct pad {
+    int c, h, w, top, left, out_h, out_w;
+};
+
+/* Each map from (top, left) on, with zeros around. */
+static void zero_pad(const float *x, float *y, struct pad s) {
+    for (int i = 0; i < s.c * s.out_h * s.out_w; i++) {
+        y[i] = 0.0f;
+    }
+    for (int row = 0; row < s.c * s.h; row++) {
+        float *out = y + (row / s.h * s.out_h + s.top + row % s.h) * s.out_w + s.left;
+        for (int j = 0; j < s.w; j++) {
+            out[j] = *x++;
+        }
+    }
+}
+
 /* == scale */
 static void scale(float *x, int n, float factor, float offset) {
     for (int i = 0; i < n; i++) {
@@ -366,5 +384,28 @@ static float expm1_of_negative(float x) {
 static void elu(float *x, int n, float alpha) {
     for (int i = 0; i < n; i++) {
         x[i] = x[i] > 0.0f ? x[i] : alpha * expm1_of_negative(x[i]);
+    }
+}
+
+/* == hyperbolic_tangent */
+static void hyperbolic_tangent(float *x, int n) {
+    for (int i = 0; i < n; i++) {
+        float e = expm1_of_negative(x[i] > 0.0f ? -2.0f * x[i] : 2.0f * x[i]);
+        float size = -e / (e + 2.0f);
+        x[i] = x[i] > 0.0f ? size : -size;
+    }
+}
+
+/* == leaky_relu */
+static void leaky_relu(float *x, int n, float slope) {
+    for (int i = 0; i < n; i++) {
+        x[i] = x[i] > 0.0f ? x[i] : slope * x[i];
+    }
+}
+
+/* == softsign */
+static void softsign(float *x, int n) {
+    for (int i = 0; i < n; i++) {
+        x[i] = x[i] / (1.0f + (x[i] > 0.0f ? x[i] : -x[i]));
     }
 }

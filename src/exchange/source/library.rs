@@ -330,6 +330,26 @@ fn crop(x: &[f32], y: &mut [f32], s: Crop) {
     }
 }
 
+// == zero_pad
+struct Pad {
+    c: usize,
+    h: usize,
+    w: usize,
+    top: usize,
+    left: usize,
+    out_h: usize,
+    out_w: usize,
+}
+
+/// Each map from (`top`, `left`) on, with zeros around.
+fn zero_pad(x: &[f32], y: &mut [f32], s: Pad) {
+    y[..s.c * s.out_h * s.out_w].fill(0.0);
+    for (row, x) in x.chunks_exact(s.w).enumerate().take(s.c * s.h) {
+        let start = (row / s.h * s.out_h + s.top + row % s.h) * s.out_w + s.left;
+        y[start..][..s.w].copy_from_slice(x);
+    }
+}
+
 // == scale
 fn scale(x: &mut [f32], factor: f32, offset: f32) {
     x.iter_mut().for_each(|x| *x = *x * factor + offset);
@@ -371,4 +391,23 @@ fn expm1_of_negative(x: f32) -> f32 {
 // == elu
 fn elu(x: &mut [f32], alpha: f32) {
     x.iter_mut().for_each(|x| *x = if *x > 0.0 { *x } else { alpha * expm1_of_negative(*x) });
+}
+
+// == hyperbolic_tangent
+fn hyperbolic_tangent(x: &mut [f32]) {
+    for x in x {
+        let e = expm1_of_negative(if *x > 0.0 { -2.0 * *x } else { 2.0 * *x });
+        let size = -e / (e + 2.0);
+        *x = if *x > 0.0 { size } else { -size };
+    }
+}
+
+// == leaky_relu
+fn leaky_relu(x: &mut [f32], slope: f32) {
+    x.iter_mut().for_each(|x| *x = if *x > 0.0 { *x } else { slope * *x });
+}
+
+// == softsign
+fn softsign(x: &mut [f32]) {
+    x.iter_mut().for_each(|x| *x /= 1.0 + if *x > 0.0 { *x } else { -*x });
 }

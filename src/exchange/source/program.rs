@@ -100,7 +100,7 @@ fn needs(function: &str) -> &'static [&'static str] {
         "hls" => &["extremes", "round_half_even"],
         "lab" => &["descale", "clamp_level"],
         "max_pool" | "average_pool" => &["pool"],
-        "elu" => &["exp"],
+        "elu" | "hyperbolic_tangent" => &["exp"],
         _ => &[],
     }
 }
@@ -295,6 +295,11 @@ impl<'a> Program<'a> {
             }
             Op::Relu => self.call(Some(name.clone()), "relu", vec![change(self)]),
             Op::Elu { alpha } => self.call(Some(name.clone()), "elu", vec![change(self), Arg::Float(*alpha)]),
+            Op::LeakyRelu { slope } => {
+                self.call(Some(name.clone()), "leaky_relu", vec![change(self), Arg::Float(*slope)]);
+            }
+            Op::Tanh => self.call(Some(name.clone()), "hyperbolic_tangent", vec![change(self)]),
+            Op::Softsign => self.call(Some(name.clone()), "softsign", vec![change(self)]),
             Op::PRelu { slopes } => {
                 let repeat = Arg::Int(input.len() / slopes.len());
                 let slopes = self.array(array("slope"), Values::F32(slopes.clone()));
@@ -312,6 +317,11 @@ impl<'a> Program<'a> {
                 let mut sizes = map_sizes(*input);
                 sizes.extend([("top", *top), ("left", *left), ("out_h", output.h), ("out_w", output.w)]);
                 self.map_call(step, "crop", vec![Arg::Sizes("crop", sizes)]);
+            }
+            Op::ZeroPad { top, left } => {
+                let mut sizes = map_sizes(*input);
+                sizes.extend([("top", *top), ("left", *left), ("out_h", output.h), ("out_w", output.w)]);
+                self.map_call(step, "zero_pad", vec![Arg::Sizes("pad", sizes)]);
             }
             // A map is laid out as the vector is.
             Op::Flatten => {}
