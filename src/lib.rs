@@ -159,6 +159,7 @@ pub mod loss;
 pub mod main_job;
 pub mod model_file;
 pub mod network;
+pub mod new_folder;
 pub mod optimizer;
 pub mod pilot;
 pub mod random;

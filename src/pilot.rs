@@ -65,8 +65,10 @@ impl Pilot {
         let Model { recipe, parameters, .. } = model;
         let network = recipe.network(isa)?;
         let [height, width] = recipe.preprocessing.source;
+        let mut plan = InferencePlan::new(&network, 1);
+        plan.prepare(&network, &parameters);
         Ok(Pilot {
-            plan: InferencePlan::new(&network, 1),
+            plan,
             preprocessor: recipe.preprocessing.plan(height, width)?,
             image: RgbImage::default(),
             planes: vec![0; recipe.preprocessing.output_len()],
@@ -105,7 +107,7 @@ impl Pilot {
         self.preprocessor.apply(rgb, &mut self.planes);
         self.model.recipe.preprocessing.to_input(&self.planes, &mut self.input);
         let mut steering = [0.0];
-        self.plan.run(&self.model.network, &self.model.parameters, &self.input, &mut steering);
+        self.plan.run_prepared(&self.model.network, &self.model.parameters, &self.input, &mut steering);
         Ok(steering[0])
     }
 

@@ -16,6 +16,7 @@ mod serve;
 mod share_bar;
 mod sim;
 mod summary;
+mod tracks;
 mod train;
 
 use std::io::{ErrorKind, Write};
@@ -52,6 +53,7 @@ enum Command {
     Predict(predict::PredictArgs),
     Export(export::ExportArgs),
     Inspect(inspect::InspectArgs),
+    Tracks(tracks::TracksArgs),
     Summary(summary::SummaryArgs),
     Bench(bench::BenchArgs),
 }
@@ -70,6 +72,7 @@ pub fn main() -> ExitCode {
         Command::Predict(args) => predict::run(args),
         Command::Export(args) => export::run(args),
         Command::Inspect(args) => inspect::run(args),
+        Command::Tracks(args) => tracks::run(args),
         Command::Summary(args) => summary::run(args),
         Command::Bench(args) => bench::run(args, started),
     };

@@ -5,6 +5,7 @@
 
 mod inference;
 mod spec;
+mod stages;
 mod training;
 
 use std::fmt::Write as _;

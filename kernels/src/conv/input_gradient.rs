@@ -70,7 +70,8 @@ fn bands_of(
                 out: span.out + from * columns,
                 lanes: span.lanes,
             }));
-            let taps = (from..end).map(|row| met(rows.first + row)).reduce(|a, b| a.start.min(b.start)..a.end.max(b.end));
+            let taps =
+                (from..end).map(|row| met(rows.first + row)).reduce(|a, b| a.start.min(b.start)..a.end.max(b.end));
             bands.push(Band { spans: first_span..spans.len(), taps: taps.unwrap_or(0..0) });
             from = end;
         }
