@@ -4,9 +4,11 @@
 //! JSON value. Exit codes: 0 done, 1 error, 2 wrong arguments, 130 interrupted.
 
 mod bench;
+mod compare;
 mod drive;
 mod evaluate;
 mod experiment;
+mod explain;
 mod export;
 mod inspect;
 mod predict;
@@ -54,6 +56,8 @@ enum Command {
     Export(export::ExportArgs),
     Inspect(inspect::InspectArgs),
     Tracks(tracks::TracksArgs),
+    Explain(explain::ExplainArgs),
+    Compare(compare::CompareArgs),
     Summary(summary::SummaryArgs),
     Bench(bench::BenchArgs),
 }
@@ -73,6 +77,8 @@ pub fn main() -> ExitCode {
         Command::Export(args) => export::run(args),
         Command::Inspect(args) => inspect::run(args),
         Command::Tracks(args) => tracks::run(args),
+        Command::Explain(args) => explain::run(args),
+        Command::Compare(args) => compare::run(args),
         Command::Summary(args) => summary::run(args),
         Command::Bench(args) => bench::run(args, started),
     };
