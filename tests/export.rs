@@ -267,6 +267,8 @@ fn a_file_that_exists_is_kept_and_bad_input_says_what_to_do() {
     assert!(
         error(dir, &["export", "mine.onnx", "b.onnx", "--to", "onnx"]).contains("mine.onnx: is no safetensors file")
     );
+    let onto_itself = ["export", "model.safetensors", "./model.safetensors", "--to", "c", "--force"];
+    assert!(error(dir, &onto_itself).contains("is the model itself"));
     assert!(error(dir, &["export", "gone", "b.onnx", "--to", "onnx"]).contains("gone"));
     assert!(error(dir, &["export", "model.safetensors", "no/b.c", "--to", "c"]).contains("no"));
     assert!(!dir.join("b.onnx").exists());

@@ -1,6 +1,6 @@
 //! `steersman export`: a model for other programs.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
 use serde::Serialize;
@@ -63,6 +63,12 @@ pub fn run(args: ExportArgs) -> Result<()> {
         )));
     }
     let model = Model::load(&args.model)?;
+    if same_file(&args.model, &args.file) {
+        return Err(Error::Usage(format!(
+            "{} is the model itself; give another name for the export",
+            args.file.display()
+        )));
+    }
     let with_preprocessing = args.with_preprocessing || !matches!(args.to, Format::Onnx);
     let (bytes, kind) = match args.to {
         Format::Onnx => {
@@ -86,4 +92,9 @@ pub fn run(args: ExportArgs) -> Result<()> {
     };
     let file = exported.file.display();
     print(&format!("{file}: {kind}, {} KiB\ntakes {takes}\n", exported.bytes.div_ceil(1024)))
+}
+
+/// Whether both paths lead to the same file, which exists.
+fn same_file(a: &Path, b: &Path) -> bool {
+    matches!((a.canonicalize(), b.canonicalize()), (Ok(a), Ok(b)) if a == b)
 }
