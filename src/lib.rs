@@ -7,8 +7,8 @@
 //! once and preprocesses it; a [`recipe`] says how, and what network to train; [`network`] plans the buffers of its
 //! [`layers`] and runs them; [`training`] goes through the epochs, follows the gradient with an [`optimizer`] and writes the
 //! run folder; [`model_file`] is what remains; a [`pilot`] loads it and steers. [`report`] measures how well it predicts,
-//! and [`simulator`] how well it drives. [`exchange`] reads models of other
-//! programs. [`cli`] is the command line.
+//! and [`simulator`] how well it drives; [`exchange`] reads models of other programs and writes ours down for them. [`cli`] is
+//! the command line.
 //!
 //! Dependencies point one way: `steersman-kernels` (all vector code and every `unsafe` line) ← [`tensor`] ← [`layers`] ←
 //! [`network`] (with the [`loss`]) ← [`optimizer`] ← [`training`]; [`dataset`] and [`simulator`] know no network.
@@ -21,15 +21,55 @@
 //! - **No allocation** in a training step or a prediction once the buffers are planned.
 //! - **Evaluation changes nothing**: it borrows the parameters shared.
 //!
-//! # Predict with a trained model
+//! # Steer with a trained model
 //!
 //! ```no_run
 //! use std::path::Path;
 //! use steersman::pilot::Pilot;
 //!
 //! let mut pilot = Pilot::load(Path::new("runs/lenet-1/model.safetensors"))?;
-//! let steering = pilot.steer_file(Path::new("frame.jpg"))?;
-//! println!("{steering:+.3}");
+//! let (height, width) = (160, 320);
+//! let rgb = vec![128; height * width * 3]; // a frame, row by row; `steer_encoded` and `steer_file` take JPEG and PNG
+//! let steering = pilot.steer(height, width, &rgb)?; // roughly in [-1, 1], positive to the right
+//! println!("{:+.1} degrees", pilot.recipe().full_lock_deg * f64::from(steering));
+//! # Ok::<(), steersman::Error>(())
+//! ```
+//!
+//! [`exchange`] writes the same model as ONNX, C or Rust for programs that do not link this crate.
+//!
+//! # Train on a recording of your own
+//!
+//! A recording is a folder with a `driving_log.csv`, or a donkeycar tub; `data/sample` is a very short one.
+//!
+//! ```
+//! use std::sync::atomic::AtomicBool;
+//! use steersman::recipe::Recipe;
+//! use steersman::training::{EpochRecord, Observer, TrainRequest, train};
+//!
+//! struct Printer;
+//!
+//! impl Observer for Printer {
+//!     fn notice(&mut self, text: &str) {
+//!         println!("{text}");
+//!     }
+//!     fn progress(&mut self, _epoch: u32, _images: usize, _of: usize) {}
+//!     fn epoch(&mut self, record: &EpochRecord, of: u32) {
+//!         println!("epoch {} of {of}: loss {:.4}", record.epoch, record.train_loss);
+//!     }
+//! }
+//!
+//! # let folder = tempfile::tempdir().unwrap();
+//! # let out = folder.path().join("run");
+//! # /*
+//! let out = "runs/mine".into();
+//! # */
+//! // The recipe is the experiment: preprocessing, network, split, optimizer. A path ending in .toml names one of your own.
+//! let recipe = Recipe::find("lenet", &["epochs=2".into(), "batch=16".into()])?;
+//! let request = TrainRequest { recordings: vec!["data/sample".into()], recipe, out, seed: 1, cache_mib: 64, from: None };
+//! let stop = AtomicBool::new(false); // set from elsewhere, it ends the run after the current batch
+//! let result = train(request, &mut Printer, &stop)?;
+//! println!("{}: mean squared error {:?} on the validation side", result.model.display(), result.val_mse);
+//! # assert!(result.model.is_file() && result.epochs == 2);
 //! # Ok::<(), steersman::Error>(())
 //! ```
 //!
@@ -62,7 +102,52 @@
 //! # Ok::<(), steersman::Error>(())
 //! ```
 //!
-//! How to add a layer stands in [`layers`], how to add a recipe in [`recipe`].
+//! # Add a layer
+//!
+//! A layer is its forward pass and its hand-written backward pass; [`gradcheck`](layers::gradcheck) compares the two by finite
+//! differences, and panics with the name of the tensor if they disagree. What else makes it a layer that recipes can name
+//! stands in [`layers`]; how to add a recipe, in [`recipe`].
+//!
+//! ```
+//! use steersman::layers::gradcheck::check_layer;
+//! use steersman::layers::{Grads, Layer, Pair, Pass};
+//! use steersman::tensor::Shape;
+//!
+//! /// Softplus: `y = ln(1 + eˣ)`, `dx = dy / (1 + e⁻ˣ)`.
+//! #[derive(Debug)]
+//! struct Softplus {
+//!     shape: Shape,
+//! }
+//!
+//! impl Layer for Softplus {
+//!     fn input(&self) -> Shape {
+//!         self.shape
+//!     }
+//!
+//!     fn output(&self) -> Shape {
+//!         self.shape
+//!     }
+//!
+//!     fn infer(&self, _: &[f32], _: &[f32], _: usize, x: &[f32], y: &mut [f32], _: &mut [f32]) {
+//!         for (y, x) in y.iter_mut().zip(x) {
+//!             *y = x.exp().ln_1p();
+//!         }
+//!     }
+//!
+//!     fn forward(&self, params: &[f32], _: &Pass, n: usize, x: &[f32], y: &mut [f32], scratch: &mut [f32]) {
+//!         self.infer(params, &[], n, x, y, scratch); // training is no different
+//!     }
+//!
+//!     fn backward(&self, _: &[f32], _: &Pass, _: usize, pair: Pair, dx: Option<&mut [f32]>, _: Grads) {
+//!         let Some(dx) = dx else { return };
+//!         for ((dx, dy), x) in dx.iter_mut().zip(pair.dy).zip(pair.x) {
+//!             *dx = dy / (1.0 + (-x).exp());
+//!         }
+//!     }
+//! }
+//!
+//! check_layer(&Softplus { shape: Shape::new(2, 3, 5) }, 3);
+//! ```
 #![forbid(unsafe_code)]
 
 pub mod atomic_file;

@@ -20,7 +20,8 @@ use crate::recipe::Recipe;
 const FORMAT: u32 = 1;
 const METADATA_KEY: &str = "steersman";
 const TRAINING_ROWS: &str = "training_rows";
-const LABEL: &str =
+/// What the number means that a model gives.
+pub(crate) const LABEL: &str =
     "steering in [-1, 1], positive to the right; times recipe.full_lock_deg it is degrees of the front wheels";
 
 /// A network with its numbers and its story.
@@ -58,6 +59,23 @@ pub struct TrainingRecord {
     pub val_center_mse: Option<f64>,
     /// Share of validation frames with a training frame of the same session within one second, in percent.
     pub leak_percent: f64,
+    /// The model that training began from; absent for a fresh start.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub transfer: Option<Transfer>,
+}
+
+/// What a training run took over from a model.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Transfer {
+    /// The model, as it was named on the command line.
+    pub model: String,
+    /// Layers that began with its weights.
+    pub taken: Vec<String>,
+    /// Layers that began with fresh ones.
+    pub fresh: Vec<String>,
+    /// Layers that kept what they were given, their running statistics too.
+    pub frozen: Vec<String>,
 }
 
 #[derive(Serialize, Deserialize)]

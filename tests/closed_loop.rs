@@ -36,6 +36,7 @@ fn learn(folder: &Path, threads: usize) -> (TrainResult, TrackResult) {
             out: folder.join(format!("run-{threads}")),
             seed: 1,
             cache_mib: 256,
+            from: None,
         };
         let result = train(request, &mut Silent, &AtomicBool::new(false)).unwrap();
         let pilot = Pilot::load(&result.model).unwrap();
@@ -75,7 +76,7 @@ struct StopsAfterAnEpoch<'a>(&'a AtomicBool);
 
 impl Observer for StopsAfterAnEpoch<'_> {
     fn notice(&mut self, _: &str) {}
-    fn progress(&mut self, _: u32, _: usize, _: usize) {}
+    fn progress(&mut self, _: u32, _: usize, _: usize, _: f64) {}
     fn epoch(&mut self, _: &EpochRecord, _: u32) {
         self.0.store(true, Ordering::Relaxed);
     }

@@ -3,10 +3,12 @@
 
 use std::sync::{Mutex, PoisonError};
 
-use steersman::network::{InferencePlan, Network, Parameters, StepInput, TrainingPlan};
+use steersman::loss::Loss;
+use steersman::network::{InferencePlan, LayerSpec, Network, Parameters, StepInput, TrainingPlan};
 use steersman::optimizer::Optimizer;
 use steersman::random::{Purpose, rng, uniform};
 use steersman::recipe::Recipe;
+use steersman::tensor::Shape;
 use steersman_kernels::Isa;
 
 #[global_allocator]
@@ -149,5 +151,68 @@ fn a_network_can_learn_eight_images_by_heart() {
         let first = setup.step(&mut plan, &mut optimizer, &mut parameters);
         let last = (0..300).map(|_| setup.step(&mut plan, &mut optimizer, &mut parameters)).last().unwrap();
         assert!(last < first / 30.0, "{recipe}: from {first} to {last}");
+    }
+}
+
+/// Mean squared error in evaluation.
+fn evaluation_loss(network: &Network, parameters: &Parameters, x: &[f32], labels: &[f32]) -> f64 {
+    let mut y = vec![0.0; labels.len()];
+    InferencePlan::new(network, labels.len()).run(network, parameters, x, &mut y);
+    y.iter().zip(labels).map(|(y, label)| f64::from(y - label).powi(2)).sum::<f64>() / labels.len() as f64
+}
+
+#[test]
+fn gradients_around_frozen_layers_are_those_of_evaluation_and_frozen_layers_have_none() {
+    #[derive(serde::Deserialize)]
+    struct Layers {
+        layers: Vec<LayerSpec>,
+    }
+    let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
+    let text = "layers = [{kind='scale', factor=1.5, offset=0.1}, {kind='conv2d', filters=3, kernel=[3, 3]}, \
+                {kind='batch_norm'}, {kind='elu'}, {kind='conv2d', filters=2, kernel=[2, 3]}, {kind='batch_norm'}, \
+                {kind='elu'}, {kind='dense', units=1}]";
+    let layers = toml::from_str::<Layers>(text).unwrap().layers;
+    let mut random = rng(3, Purpose::Test, 0, 0);
+    let mut numbers =
+        |len: usize, low: f64| -> Vec<f32> { (0..len).map(|_| uniform(&mut random, low, 1.0) as f32).collect() };
+    for frozen in [&["bn1", "bn2"][..], &["bn1", "bn2", "conv2"], &["bn1", "bn2", "conv1"]] {
+        let mut network = Network::new(Shape::new(2, 6, 7), &layers, Isa::best()).unwrap();
+        network.freeze(&frozen.iter().map(|name| name.to_string()).collect::<Vec<_>>()).unwrap();
+        let mut parameters = network.initialize(5);
+        let statistics = parameters.statistics.len();
+        parameters.statistics = numbers(statistics, 0.3);
+        let (x, labels) = (numbers(4 * network.input().len(), -1.0), numbers(4, -1.0));
+
+        let mut plan = TrainingPlan::new(&network, 4);
+        let before = parameters.clone();
+        let input = StepInput { x: &x, labels: &labels, seed: 1, step: 0 };
+        let loss = plan.step(&network, &mut parameters, &Loss::default(), input);
+        assert!((loss - evaluation_loss(&network, &before, &x, &labels)).abs() < 1e-5);
+        assert_eq!(parameters, before, "a step moves no frozen statistics");
+
+        for tensor in network.tensors().iter().filter(|tensor| tensor.trainable) {
+            let gradient = &plan.gradient()[tensor.range.clone()];
+            if tensor.frozen {
+                assert!(gradient.iter().all(|g| *g == 0.0), "{}", tensor.name);
+                continue;
+            }
+            let numerical = tensor.range.clone().map(|index| {
+                let mut moved = before.clone();
+                let mut at = |value: f32| {
+                    moved.values[index] = value;
+                    evaluation_loss(&network, &moved, &x, &labels)
+                };
+                let (up, down) = (before.values[index] + 1e-2, before.values[index] - 1e-2);
+                (at(up) - at(down)) / f64::from(up - down)
+            });
+            let (mut error, mut norm) = (0.0, 0.0);
+            for (gradient, numerical) in gradient.iter().zip(numerical) {
+                error += (f64::from(*gradient) - numerical).powi(2);
+                norm += numerical.powi(2);
+            }
+            assert!(error.sqrt() <= 5e-3 * norm.sqrt(), "{}: {} of {}", tensor.name, error.sqrt(), norm.sqrt());
+        }
+        let norm = plan.gradient().iter().map(|g| f64::from(*g).powi(2)).sum::<f64>().sqrt();
+        assert!((plan.gradient_norm() - norm).abs() < 1e-6 * norm, "the norm that clips leaves frozen layers out");
     }
 }

@@ -9,6 +9,7 @@ mod drive;
 mod evaluate;
 mod experiment;
 mod explain;
+mod export;
 mod import;
 mod inspect;
 mod predict;
@@ -32,6 +33,7 @@ use clap::{Args, Parser, Subcommand};
 use serde::Serialize;
 
 use crate::error::{Error, Result};
+use crate::model_file::Model;
 use crate::recipe::Recipe;
 
 /// Learn to steer a car from its front camera, and drive with what was learned.
@@ -52,6 +54,7 @@ enum Command {
     Evaluate(evaluate::EvaluateArgs),
     Experiment(experiment::ExperimentArgs),
     Predict(predict::PredictArgs),
+    Export(export::ExportArgs),
     Inspect(inspect::InspectArgs),
     Tracks(tracks::TracksArgs),
     Explain(explain::ExplainArgs),
@@ -73,6 +76,7 @@ pub fn main() -> ExitCode {
         Command::Evaluate(args) => evaluate::run(args),
         Command::Experiment(args) => experiment::run(args),
         Command::Predict(args) => predict::run(args),
+        Command::Export(args) => export::run(args),
         Command::Inspect(args) => inspect::run(args),
         Command::Tracks(args) => tracks::run(args),
         Command::Explain(args) => explain::run(args),
@@ -94,9 +98,9 @@ pub fn main() -> ExitCode {
 /// Which recipe, and what to change in it.
 #[derive(Clone, Debug, Args)]
 struct RecipeArgs {
-    /// A built-in recipe (default, hyper, hyper-prelu, lenet, pilotnet) or a recipe file
-    #[arg(long, value_name = "NAME|FILE", default_value = "default")]
-    recipe: String,
+    /// A built-in recipe (default, hyper, hyper-prelu, lenet, pilotnet) or a recipe file [default: default]
+    #[arg(long, value_name = "NAME|FILE")]
+    recipe: Option<String>,
     /// Change an entry of the recipe, as in epochs=3 or optimizer.learning_rate=1e-4
     #[arg(long = "set", value_name = "KEY=VALUE")]
     overrides: Vec<String>,
@@ -104,7 +108,15 @@ struct RecipeArgs {
 
 impl RecipeArgs {
     fn find(&self) -> Result<Recipe> {
-        Recipe::find(&self.recipe, &self.overrides)
+        Recipe::find(self.recipe.as_deref().unwrap_or("default"), &self.overrides)
+    }
+
+    /// The recipe that is named, or else that of the model in the file `from`.
+    fn find_or_of(&self, from: &Path) -> Result<Recipe> {
+        match self.recipe {
+            Some(_) => self.find(),
+            None => Recipe::parse(&from.display().to_string(), &Model::load(from)?.recipe.to_toml()?, &self.overrides),
+        }
     }
 }
 

@@ -13,7 +13,7 @@ use crate::main_job::held_out::trained_on_held_out;
 use crate::main_job::job::{Job, JobNote, JobRequest, Scope};
 use crate::main_job::{MainJobResult, TrackResult, held_out};
 use crate::report;
-use crate::training::{self, RunFolder, TrainRequest, TrainResult};
+use crate::training::{self, RunFolder, TrainRequest, TrainResult, TransferRequest};
 
 /// Train a network on recordings
 #[derive(Debug, Args)]
@@ -30,6 +30,12 @@ pub struct TrainArgs {
     /// Seed of all random choices: the same seed gives the same weights, bit for bit, for any number of threads
     #[arg(long, default_value_t = 1)]
     seed: u64,
+    /// Begin with the weights of a model where layers have the same name and shape; without --recipe, with its recipe
+    #[arg(long, value_name = "MODEL", requires = "recordings", conflicts_with = "resume")]
+    from: Option<PathBuf>,
+    /// Layers that keep the weights they were given, as in conv1,bn1
+    #[arg(long, value_name = "LAYER", requires = "from", value_delimiter = ',')]
+    freeze: Vec<String>,
     /// Threads; 0 is one for each core
     #[arg(long, default_value_t = 0)]
     threads: usize,
@@ -102,7 +108,10 @@ pub fn run(args: TrainArgs) -> Result<()> {
             (folder, result)
         }
         None => {
-            let recipe = args.recipe.find()?;
+            let recipe = match &args.from {
+                Some(from) => args.recipe.find_or_of(from)?,
+                None => args.recipe.find()?,
+            };
             let held_out = held_out::check(&args.recordings, args.force_held_out)?;
             if !held_out.is_empty() {
                 eprintln!("note: {}", trained_on_held_out(&held_out));
@@ -114,6 +123,7 @@ pub fn run(args: TrainArgs) -> Result<()> {
                 out: out.clone(),
                 seed: args.seed,
                 cache_mib: args.cache,
+                from: args.from.map(|model| TransferRequest { model, freeze: args.freeze }),
             };
             let result = pool.install(|| training::train(request, &mut progress, &stop));
             (out, result)

@@ -151,12 +151,12 @@ fn gray([r, g, b]: [u8; 3]) -> u8 {
 }
 
 /// Reciprocals in 12-bit fixed point: 255 / v for the saturation, 180 / (6 d) for the hue.
-struct HsvTables {
-    saturation: [i32; 256],
-    hue: [i32; 256],
+pub(crate) struct HsvTables {
+    pub saturation: [i32; 256],
+    pub hue: [i32; 256],
 }
 
-static HSV: LazyLock<HsvTables> = LazyLock::new(|| {
+pub(crate) static HSV: LazyLock<HsvTables> = LazyLock::new(|| {
     let table = |numerator: f64| {
         std::array::from_fn(|i| if i == 0 { 0 } else { (numerator * 4096.0 / i as f64).round_ties_even() as i32 })
     };
@@ -212,14 +212,18 @@ fn hls(pixel: [u8; 3]) -> [u8; 3] {
 }
 
 /// L*a*b* in fixed point: sRGB to linear light with 3 extra bits, the cube root with 15 bits.
-struct LabTables {
-    linear: [i32; 256],
-    root: Vec<i32>,
+pub(crate) struct LabTables {
+    pub linear: [i32; 256],
+    pub root: Vec<i32>,
     /// Linear RGB to X, Y, Z over the D65 white point, 12 bits.
-    xyz: [[i32; 3]; 3],
+    pub xyz: [[i32; 3]; 3],
 }
 
-static LAB: LazyLock<LabTables> = LazyLock::new(|| {
+/// 116 and −16 of the lightness, scaled by 255/100; the second in 15-bit fixed point.
+pub(crate) const L_SCALE: i32 = (116 * 255 + 50) / 100;
+pub(crate) const L_SHIFT: i32 = -((16 * 255 * (1 << 15) + 50) / 100);
+
+pub(crate) static LAB: LazyLock<LabTables> = LazyLock::new(|| {
     let linear = |i: usize| {
         let x = i as f64 / 255.0;
         let light = if x <= 0.04045 { x / 12.92 } else { ((x + 0.055) / 1.055).powf(2.4) };
@@ -242,9 +246,6 @@ static LAB: LazyLock<LabTables> = LazyLock::new(|| {
 /// L = 116 f(Y) − 16, a = 500 (f(X) − f(Y)) + 128, b = 200 (f(Y) − f(Z)) + 128.
 #[inline(always)]
 fn lab(tables: &LabTables, pixel: [u8; 3]) -> [u8; 3] {
-    /// 116 and 16 scaled by 255/100, in 15-bit fixed point.
-    const L_SCALE: i32 = (116 * 255 + 50) / 100;
-    const L_SHIFT: i32 = -((16 * 255 * (1 << 15) + 50) / 100);
     let [r, g, b] = pixel.map(|x| tables.linear[usize::from(x)]);
     let [fx, fy, fz] = tables.xyz.map(|[cr, cg, cb]| tables.root[descale(r * cr + g * cg + b * cb, 12) as usize]);
     let l = descale(L_SCALE * fy + L_SHIFT, 15);

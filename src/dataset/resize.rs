@@ -28,8 +28,9 @@ pub struct Resizer {
     method: Method,
 }
 
+/// How a planned resize goes about it.
 #[derive(Debug, Clone)]
-enum Method {
+pub(crate) enum Method {
     Copy,
     Halve,
     Linear { x: Vec<LinearTap>, y: Vec<LinearTap>, rows: [Vec<i32>; 2] },
@@ -38,18 +39,18 @@ enum Method {
 
 /// An output position lies between source positions `low` and `high`, with weights that sum to [`ONE`].
 #[derive(Debug, Clone, Copy)]
-struct LinearTap {
-    low: usize,
-    high: usize,
-    weights: [i32; 2],
+pub(crate) struct LinearTap {
+    pub low: usize,
+    pub high: usize,
+    pub weights: [i32; 2],
 }
 
 /// Which source positions an output position covers: `weights[starts[i]..starts[i + 1]]` from source `first[i]` on.
 #[derive(Debug, Clone)]
-struct AreaTaps {
-    first: Vec<usize>,
-    starts: Vec<usize>,
-    weights: Vec<f32>,
+pub(crate) struct AreaTaps {
+    pub first: Vec<usize>,
+    pub starts: Vec<usize>,
+    pub weights: Vec<f32>,
 }
 
 impl Resizer {
@@ -73,6 +74,11 @@ impl Resizer {
             Method::Linear { x, y, rows: [0, 1].map(|_| vec![0; to[1] * channels]) }
         };
         Self { from, to, channels, method }
+    }
+
+    /// How it goes about it.
+    pub(crate) fn method(&self) -> &Method {
+        &self.method
     }
 
     /// Height and width of the result.
@@ -153,7 +159,7 @@ impl AreaTaps {
     }
 
     /// First source position and weights of output position `i`.
-    fn of(&self, i: usize) -> (usize, &[f32]) {
+    pub fn of(&self, i: usize) -> (usize, &[f32]) {
         (self.first[i], &self.weights[self.starts[i]..self.starts[i + 1]])
     }
 }

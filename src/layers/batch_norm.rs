@@ -16,6 +16,9 @@ use crate::tensor::Shape;
 ///
 /// The running variance keeps the population variance (divided by N, as in Keras 1, not by N − 1).
 ///
+/// Frozen, it computes with the running statistics in training too, which then do not depend on x: `dx = gamma /
+/// √(variance + ε) · dy`.
+///
 /// Parameters: `gamma` and `beta` `[c]`; statistics: `running_mean` and `running_variance` `[c]`.
 #[derive(Clone, Debug)]
 pub struct BatchNorm {
@@ -177,6 +180,23 @@ impl BatchStatistics for BatchNorm {
             let old = self.running_old_weight;
             running_mean[i] = old * running_mean[i] + (1.0 - old) * mean as f32;
             running_variance[i] = old * running_variance[i] + (1.0 - old) * variance as f32;
+        }
+    }
+
+    fn frozen_moments(&self, params: &[f32], statistics: &[f32], moments: &mut [f32]) {
+        let c = self.shape.c;
+        let (gamma, beta) = params.split_at(c);
+        let (mean, variance) = statistics.split_at(c);
+        // The means of the gradients stay 0: mean and variance do not depend on x.
+        moments.fill(0.0);
+        for i in 0..c {
+            let inv_std = 1.0 / (variance[i] + self.epsilon).sqrt();
+            let scale = gamma[i] * inv_std;
+            moments[i] = mean[i];
+            moments[c + i] = inv_std;
+            moments[2 * c + i] = scale;
+            moments[3 * c + i] = beta[i] - mean[i] * scale;
+            moments[6 * c + i] = scale;
         }
     }
 

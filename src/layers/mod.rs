@@ -236,6 +236,10 @@ pub trait BatchStatistics {
     /// statistics moved on.
     fn finish_forward(&self, params: &[f32], images: usize, sums: &[f64], moments: &mut [f32], statistics: &mut [f32]);
 
+    /// What [`Layer::forward`] and [`Layer::backward`] need where the layer is frozen: it goes by its running statistics then,
+    /// as in evaluation, and needs no barrier.
+    fn frozen_moments(&self, params: &[f32], statistics: &[f32], moments: &mut [f32]);
+
     /// Overwrites `sums` with the sums over the `n` images of `x` and `dy`, and adds the gradients of the parameters that
     /// follow from them to `dparams`.
     fn backward_sums(&self, moments: &[f32], n: usize, x: &[f32], dy: &[f32], sums: &mut [f64], dparams: &mut [f32]);

@@ -136,6 +136,7 @@ pub fn run(
                 out: folder.path().join(format!("{variant}-{seed}")),
                 seed,
                 cache_mib: plan.cache_mib,
+                from: None,
             };
             let training = training::train(request, observer, stop)?;
             let options = DriveOptions { runs: plan.runs, ..Default::default() };

@@ -135,7 +135,7 @@ impl<'a> Job<'a> {
             RunFolder::require_free(&dagger_folder(&out, 0, round)?)?;
         }
         let recordings = training_set(&self.scope.recordings, &self.scope.takes, self.stages, self.stop)?;
-        let training = self.train(TrainRequest { recordings, recipe, out, seed, cache_mib })?;
+        let training = self.train(TrainRequest { recordings, recipe, out, seed, cache_mib, from: None })?;
         self.rest(training)
     }
 
@@ -191,7 +191,7 @@ impl<'a> Job<'a> {
         let mut recordings = info.recordings;
         recordings.extend(recorded);
         self.note.round = round;
-        self.train(TrainRequest { recordings, recipe, out, seed: info.seed, cache_mib: info.cache_mib })
+        self.train(TrainRequest { recordings, recipe, out, seed: info.seed, cache_mib: info.cache_mib, from: None })
     }
 
     /// Drives `model` on every track of the job.

@@ -22,6 +22,7 @@ pub use training::{StepInput, TrainingPlan};
 use crate::error::{Error, Result};
 use crate::layers::{Layer, ParamSpec};
 use crate::random::{Purpose, rng};
+use crate::recipe::did_you_mean;
 use crate::tensor::Shape;
 
 /// Layers in order, each knowing its input shape.
@@ -46,6 +47,8 @@ pub struct NamedLayer {
     pub params: Range<usize>,
     /// Where its running statistics lie in [`Parameters::statistics`].
     pub statistics: Range<usize>,
+    /// Whether training leaves its parameters and statistics as they are.
+    pub frozen: bool,
 }
 
 /// One named tensor of a network.
@@ -59,6 +62,8 @@ pub struct Tensor {
     pub trainable: bool,
     /// Where it lies: in [`Parameters::values`] if trainable, else in [`Parameters::statistics`].
     pub range: Range<usize>,
+    /// Whether training leaves it as it is, because its layer is frozen.
+    pub frozen: bool,
 }
 
 /// The numbers of a network.
@@ -105,7 +110,8 @@ impl Network {
                 for spec in specs {
                     let range = *end..*end + spec.len();
                     *end = range.end;
-                    network.tensors.push(Tensor { name: format!("{name}.{}", spec.name), spec, trainable, range });
+                    let name = format!("{name}.{}", spec.name);
+                    network.tensors.push(Tensor { name, spec, trainable, range, frozen: false });
                 }
             }
             network.layers.push(NamedLayer {
@@ -114,6 +120,7 @@ impl Network {
                 layer,
                 params: params_start..params_end,
                 statistics: statistics_start..statistics_end,
+                frozen: false,
             });
         }
         if network.layers.is_empty() {
@@ -150,6 +157,37 @@ impl Network {
         self.isa
     }
 
+    /// Freezes the layers called `names`: training leaves their parameters and running statistics as they are, and batch
+    /// normalisation computes with its running statistics in training too.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Usage`] if there is no such layer, it has no parameters, or nothing would be left to train.
+    pub fn freeze(&mut self, names: &[String]) -> Result<()> {
+        let with_parameters = |layer: &&NamedLayer| !layer.params.is_empty();
+        for name in names {
+            let Some(layer) = self.layers.iter_mut().find(|layer| layer.name == *name) else {
+                let known: Vec<&str> =
+                    self.layers.iter().filter(with_parameters).map(|layer| layer.name.as_str()).collect();
+                let hint = did_you_mean(name, &known);
+                let known = known.join(", ");
+                return Err(Error::Usage(format!(
+                    "there is no layer `{name}` to freeze{hint}; with weights are {known}"
+                )));
+            };
+            if layer.params.is_empty() {
+                return Err(Error::Usage(format!("layer `{name}` has no weights that could be frozen")));
+            }
+            layer.frozen = true;
+            let of_layer = |tensor: &&mut Tensor| tensor.name.split_once('.').is_some_and(|(layer, _)| layer == name);
+            self.tensors.iter_mut().filter(of_layer).for_each(|tensor| tensor.frozen = true);
+        }
+        if self.layers.iter().filter(with_parameters).all(|layer| layer.frozen) {
+            return Err(Error::Usage("every layer with weights is frozen; nothing is left to train".into()));
+        }
+        Ok(())
+    }
+
     /// Freshly drawn parameters. Each tensor has a random stream of its own, so the draw of one does not depend on the
     /// others.
     pub fn initialize(&self, seed: u64) -> Parameters {
@@ -179,7 +217,7 @@ impl Network {
         // Writing to a String cannot fail.
         let _ = writeln!(text, "{:<10} {:<24} {:<14} {:>10} {:>14}", "layer", "kind", "output", "params", "mult-adds");
         let _ = writeln!(text, "{rule}\n{:<35} {}", "input", self.input);
-        for NamedLayer { name, spec, layer, params, statistics } in &self.layers {
+        for NamedLayer { name, spec, layer, params, statistics, .. } in &self.layers {
             let count = group_digits((params.len() + statistics.len()) as u64);
             let multiply_adds = match layer.multiply_adds() {
                 0 => String::new(),

@@ -5,7 +5,7 @@
 //! | batch norm, ReLU or PReLU, then max pool 2x2 if there is one, after a convolution or dense layer | [`NormRectify`] | one pass over the maps instead of three, and nothing between is written; the gradient of the convolution's output takes its place |
 //! | convolution of stride 1 without padding, ReLU or ELU, max pool 4x4 | [`PooledConv`] | the activation of a 16th of the values; gradients from a 16th of the positions |
 //!
-//! Everything else runs layer by layer. What runs as one computes the same as its layers, up to rounding.
+//! Everything else runs layer by layer, frozen batch norm too. What runs as one computes the same as its layers, up to rounding.
 
 use std::ops::Range;
 
@@ -32,13 +32,23 @@ pub(super) enum Kind {
 }
 
 impl Stage {
-    /// The barrier of a stage that needs one.
+    /// The barrier of a stage that needs one: frozen layers go by their running statistics.
     pub fn barrier<'a>(&'a self, network: &'a Network) -> Option<&'a dyn BatchStatistics> {
+        self.batch_statistics(network).filter(|_| !network.layers()[self.layers.start].frozen)
+    }
+
+    /// The statistics of batch normalisation, frozen or not.
+    pub fn batch_statistics<'a>(&'a self, network: &'a Network) -> Option<&'a dyn BatchStatistics> {
         match &self.kind {
             Kind::Layer => network.layers()[self.layers.start].layer.batch_statistics(),
             Kind::NormRectify(fused) => Some(fused.batch_statistics()),
             Kind::PooledConv(_) => None,
         }
+    }
+
+    /// Whether training changes any of its parameters.
+    pub fn learns(&self, network: &Network) -> bool {
+        network.layers()[self.layers.clone()].iter().any(|layer| !layer.params.is_empty() && !layer.frozen)
     }
 
     /// Where its parameters lie.
@@ -113,6 +123,10 @@ pub(super) fn stages(network: &Network) -> Vec<Stage> {
 /// The layers at the start of `layers` that a [`NormRectify`] stands for, and how many they are.
 fn norm_rectify(network: &Network, layers: &[NamedLayer]) -> Option<(usize, NormRectify)> {
     let LayerSpec::BatchNorm { epsilon, running_old_weight } = layers.first()?.spec else { return None };
+    // It takes the gradients of its slopes at the barrier, which frozen batch norm has not.
+    if layers[0].frozen {
+        return None;
+    }
     let slopes = match layers.get(1)?.spec {
         LayerSpec::Relu {} => None,
         LayerSpec::PRelu { slopes, .. } => Some(slopes),

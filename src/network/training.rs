@@ -58,6 +58,8 @@ pub struct TrainingPlan {
     sums: Vec<f64>,
     /// Runs of stages without a barrier inside; each but the first begins with the stage that needs the barrier.
     segments: Vec<Range<usize>>,
+    /// The first stage that learns: below it nobody asks for a gradient.
+    first_learning: usize,
     capacity: usize,
     isa: Isa,
 }
@@ -94,7 +96,7 @@ impl TrainingPlan {
         let (mut moments_end, mut sums_len) = (0, 0);
         for (index, stage) in stages.iter().enumerate() {
             let barrier = stage.barrier(network);
-            let len = barrier.map_or(0, BatchStatistics::moments_len);
+            let len = stage.batch_statistics(network).map_or(0, BatchStatistics::moments_len);
             moments_of.push(moments_end..moments_end + len);
             moments_end += len;
             if let Some(barrier) = barrier {
@@ -137,6 +139,7 @@ impl TrainingPlan {
             shards,
             gradient: vec![0.0; network.count(true)],
             chunk_squares: vec![0.0; network.count(true).div_ceil(CHUNK)],
+            first_learning: stages.iter().position(|stage| stage.learns(network)).unwrap_or(stages.len()),
             stages,
             moments: vec![0.0; moments_end],
             moments_of,
@@ -181,13 +184,26 @@ impl TrainingPlan {
         for (index, shard) in self.shards[..used].iter_mut().enumerate() {
             shard.images = index * shard_images..((index + 1) * shard_images).min(n);
         }
+        self.freeze_moments(network, parameters);
         if self.segments.len() == 1 {
             self.step_without_barriers(network, parameters, loss, input, used);
         } else {
             self.step_with_barriers(network, parameters, loss, input, used);
         }
-        self.reduce_gradient(used);
+        self.reduce_gradient(network, used);
         self.shards[..used].iter().map(|shard| shard.loss).sum::<f64>() / input.labels.len() as f64
+    }
+
+    /// The moments of frozen batch normalisation.
+    fn freeze_moments(&mut self, network: &Network, parameters: &Parameters) {
+        for (stage, moments_of) in self.stages.iter().zip(&self.moments_of) {
+            let layer = &network.layers()[stage.layers.start];
+            if let Some(statistics) = stage.batch_statistics(network).filter(|_| layer.frozen) {
+                let params = &parameters.values[layer.params.clone()];
+                let running = &parameters.statistics[layer.statistics.clone()];
+                statistics.frozen_moments(params, running, &mut self.moments[moments_of.clone()]);
+            }
+        }
     }
 
     fn step_without_barriers(
@@ -198,8 +214,8 @@ impl TrainingPlan {
         input: StepInput,
         used: usize,
     ) {
-        let TrainingPlan { shards, stages, .. } = self;
-        let run = Run { network, parameters, stages, moments: &[], moments_of: &[], input };
+        let TrainingPlan { shards, stages, moments, moments_of, first_learning, .. } = self;
+        let run = Run { network, parameters, stages, moments, moments_of, first_learning: *first_learning, input };
         shards[..used].par_iter_mut().for_each(|shard| {
             shard.reset();
             let group = shard.group_capacity(network);
@@ -220,7 +236,8 @@ impl TrainingPlan {
         input: StepInput,
         used: usize,
     ) {
-        let TrainingPlan { shards, stages, moments, moments_of, sums, segments, .. } = self;
+        let TrainingPlan { shards, stages, moments, moments_of, sums, segments, first_learning, .. } = self;
+        let first_learning = *first_learning;
         let shards = &mut shards[..used];
         let images = shards.last().map_or(0, |shard| shard.images.end);
         let barrier = |stage: usize| {
@@ -229,7 +246,7 @@ impl TrainingPlan {
         let last = segments.len() - 1;
 
         for (index, segment) in segments.iter().enumerate() {
-            let run = Run { network, parameters, stages, moments, moments_of, input };
+            let run = Run { network, parameters, stages, moments, moments_of, first_learning, input };
             let next_barrier = segments.get(index + 1).map(|next| next.start);
             shards.par_iter_mut().for_each(|shard| {
                 if index == 0 {
@@ -254,7 +271,7 @@ impl TrainingPlan {
             }
         }
         for (index, segment) in segments.iter().enumerate().rev() {
-            let run = Run { network, parameters, stages, moments, moments_of, input };
+            let run = Run { network, parameters, stages, moments, moments_of, first_learning, input };
             // The stage at the start of a segment waits for the sums over all shards.
             let rest = if index > 0 { segment.start + 1..segment.end } else { segment.clone() };
             shards.par_iter_mut().for_each(|shard| {
@@ -277,8 +294,8 @@ impl TrainingPlan {
         }
     }
 
-    /// Adds the shards' gradients up, in their order.
-    fn reduce_gradient(&mut self, used: usize) {
+    /// Adds the shards' gradients up, in their order. Those of frozen layers count as 0.
+    fn reduce_gradient(&mut self, network: &Network, used: usize) {
         let TrainingPlan { shards, gradient, chunk_squares, isa, .. } = self;
         let shards = &shards[..used];
         gradient.par_chunks_mut(CHUNK).zip(chunk_squares.par_iter_mut()).enumerate().for_each(
@@ -287,6 +304,12 @@ impl TrainingPlan {
                 chunk.copy_from_slice(&shards[0].gradient[range.clone()]);
                 for shard in &shards[1..] {
                     update::sum_into(*isa, chunk, &shard.gradient[range.clone()]);
+                }
+                for layer in network.layers().iter().filter(|layer| layer.frozen) {
+                    let (from, to) = (layer.params.start.max(range.start), layer.params.end.min(range.end));
+                    if from < to {
+                        chunk[from - range.start..to - range.start].fill(0.0);
+                    }
                 }
                 *squares = update::sum_of_squares(*isa, chunk);
             },
@@ -345,12 +368,13 @@ struct Run<'a> {
     stages: &'a [Stage],
     moments: &'a [f32],
     moments_of: &'a [Range<usize>],
+    first_learning: usize,
     input: StepInput<'a>,
 }
 
 impl<'a> Run<'a> {
     fn pass(&self, stage: usize, first_image: usize) -> Pass<'a> {
-        let moments = self.moments_of.get(stage).map_or(&[][..], |range| &self.moments[range.clone()]);
+        let moments = &self.moments[self.moments_of[stage].clone()];
         let layer = self.stages[stage].layers.start;
         Pass { seed: self.input.seed, step: self.input.step, layer, first_image, moments }
     }
@@ -408,12 +432,14 @@ impl<'a> Run<'a> {
 
     /// Takes the gradient of the output of the last of `stages` back to the input of the first.
     fn backward(&self, stages: Range<usize>, shard: &mut Shard, images: Range<usize>) {
-        for index in stages.rev() {
+        for index in stages.rev().filter(|index| *index >= self.first_learning) {
             let stage = &self.stages[index];
             let n = images.len();
             let (x_len, y_len) = (n * stage.input_len(self.network), n * stage.output_len(self.network));
             let (params, pass) = (self.params(index), self.pass(index, images.start));
             let replaces = stage.source.filter(|_| replaces_input(self.network, self.stages, index));
+            // Nobody asks for the gradient of the images themselves, or of what comes before all that learns.
+            let wanted = stage.source.filter(|source| *source >= self.first_learning);
             match &stage.kind {
                 Kind::NormRectify(fused) => {
                     let source = replaces.expect("batch norm runs fused only after another stage");
@@ -426,7 +452,7 @@ impl<'a> Run<'a> {
                 Kind::PooledConv(fused) => {
                     let x = self.stage_input(index, &shard.activations, images.clone());
                     let pair = Pair { x, y: &shard.activations[index][..y_len], dy: &shard.d_output[..y_len] };
-                    let dx = stage.source.map(|_| &mut shard.d_input[..x_len]);
+                    let dx = wanted.map(|_| &mut shard.d_input[..x_len]);
                     let dparams = &mut shard.gradient[stage.params(self.network)];
                     let grads = Grads { dparams, scratch: &mut shard.scratch };
                     fused.backward(params, n, pair, &shard.places[index][..y_len], dx, grads);
@@ -436,12 +462,11 @@ impl<'a> Run<'a> {
                     let x = self.stage_input(index, &shard.activations, images.clone());
                     let y = &shard.activations[index][..y_len];
                     let pair = Pair { x, y, dy: if shard.in_place { y } else { &shard.d_output[..y_len] } };
-                    // Nobody asks for the gradient of the images themselves.
-                    let apart = stage.source.is_some() && replaces.is_none();
+                    let apart = wanted.is_some() && replaces.is_none();
                     let dx = if apart { Some(&mut shard.d_input[..x_len]) } else { None };
                     let dparams = &mut shard.gradient[stage.params(self.network)];
                     layer.backward(params, &pass, n, pair, dx, Grads { dparams, scratch: &mut shard.scratch });
-                    if let (Some(linear), Some(source)) = (layer.linear(), replaces) {
+                    if let (Some(linear), Some(source)) = (layer.linear(), replaces.and(wanted)) {
                         let (before, from_here) = shard.activations.split_at_mut(index);
                         let dy = if shard.in_place { &from_here[0][..y_len] } else { &shard.d_output[..y_len] };
                         linear.backward_input(params, n, dy, &mut before[source][..x_len], &mut shard.scratch);

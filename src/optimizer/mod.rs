@@ -126,7 +126,7 @@ pub struct Optimizer {
     pub first: Vec<f32>,
     /// Adam's mean of the squared gradient; empty for SGD.
     pub second: Vec<f32>,
-    /// Runs of parameters within a chunk that do or do not decay, in order.
+    /// Runs of parameters within a chunk that do or do not decay, in order; frozen ones belong to none.
     pieces: Vec<Piece>,
     /// Where the pieces of each chunk lie.
     pieces_of_chunk: Vec<Range<usize>>,
@@ -141,7 +141,7 @@ struct Piece {
 }
 
 impl Optimizer {
-    /// A fresh optimizer for the parameters of `network`; gradients with an L2 norm above `clip_norm` count as if they
+    /// A fresh optimizer for the parameters of `network` that are not frozen; gradients with an L2 norm above `clip_norm` count as if they
     /// were scaled down to it.
     pub fn new(spec: OptimizerSpec, clip_norm: Option<f64>, network: &Network) -> Optimizer {
         let count = network.count(true);
@@ -150,7 +150,7 @@ impl Optimizer {
         for start in (0..count).step_by(CHUNK) {
             let end = (start + CHUNK).min(count);
             let first = pieces.len();
-            for tensor in network.tensors().iter().filter(|t| t.trainable) {
+            for tensor in network.tensors().iter().filter(|t| t.trainable && !t.frozen) {
                 let (from, to) = (tensor.range.start.max(start), tensor.range.end.min(end));
                 if from < to {
                     pieces.push(Piece { range: from - start..to - start, decays: tensor.spec.decays });

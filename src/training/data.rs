@@ -86,6 +86,14 @@ impl Data {
         ids
     }
 
+    /// How many validation rows are among the [`Recording::row_id`]s `rows`, which are sorted; and how many there are.
+    pub fn validation_rows_among(&self, rows: &[u64]) -> (usize, usize) {
+        let mut ids: Vec<u64> = self.split.validation.iter().map(|item| self.row_id(item)).collect();
+        ids.sort_unstable();
+        ids.dedup();
+        (ids.iter().filter(|id| rows.binary_search(id).is_ok()).count(), ids.len())
+    }
+
     /// A hash over the rows of both sides, in hexadecimal digits.
     pub fn rows_hash(&self) -> String {
         let mut hash = Sha256::new();

@@ -4,6 +4,7 @@
 //! |---|---|
 //! | `recipe.toml` | the recipe with every entry resolved |
 //! | `run.json` | recordings, seed, version: what `--resume` needs besides |
+//! | `from.safetensors` | the model that the run began from, with `--from` |
 //! | `split.csv` | which row went to which side |
 //! | `history.csv` | one line an epoch |
 //! | `model.safetensors` | the best model, by validation loss |
@@ -17,6 +18,7 @@ mod data;
 mod history;
 mod run_folder;
 mod session;
+mod transfer;
 mod validation;
 
 pub use crate::loss::Loss;
@@ -25,4 +27,5 @@ pub use data::Data;
 pub use history::{EpochRecord, read_history, write_history};
 pub use run_folder::{RunFolder, RunInfo};
 pub use session::{Observer, TrainRequest, TrainResult, resume, train};
+pub use transfer::TransferRequest;
 pub use validation::{Validation, ValidationResult};

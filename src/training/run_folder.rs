@@ -9,6 +9,7 @@ use super::history::{EpochRecord, read_history};
 use super::session::TrainResult;
 use crate::atomic_file;
 use crate::error::{Error, Result};
+use crate::model_file::Transfer;
 use crate::recipe::Recipe;
 
 /// The folder of a run, and the names of what is in it.
@@ -33,6 +34,9 @@ pub struct RunInfo {
     pub cache_mib: usize,
     /// Hash over the rows of both sides: the recordings must not change during a run.
     pub rows_hash: String,
+    /// What the run took over from the model `from.safetensors`; absent for a fresh start.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub transfer: Option<Transfer>,
 }
 
 impl RunFolder {
@@ -102,6 +106,11 @@ impl RunFolder {
     /// The best model.
     pub fn model(&self) -> PathBuf {
         self.file("model.safetensors")
+    }
+
+    /// The model that the run began from, where it did not begin afresh.
+    pub fn from(&self) -> PathBuf {
+        self.file("from.safetensors")
     }
 
     /// The recipe of the run.

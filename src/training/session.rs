@@ -11,7 +11,9 @@ use super::checkpoint::{Progress, State};
 use super::data::Data;
 use super::history::{EpochRecord, write_history};
 use super::run_folder::{RunFolder, RunInfo};
+use super::transfer::{Start, TransferRequest};
 use super::validation::{Validation, ValidationResult};
+use crate::atomic_file;
 use crate::dataset::loader::{Batch, Loader};
 use crate::error::{Error, Result};
 use crate::model_file::{Model, TrainingRecord, weights_hash};
@@ -35,6 +37,8 @@ pub struct TrainRequest {
     pub seed: u64,
     /// Memory for decoded images in MiB; what does not fit goes to a temporary file.
     pub cache_mib: usize,
+    /// A model to begin from instead of fresh weights.
+    pub from: Option<TransferRequest>,
 }
 
 /// Whoever watches a run. All methods are called from the training thread.
@@ -89,7 +93,8 @@ pub struct TrainResult {
 /// a run that diverges, [`Error::Interrupted`] after saving if `stop` is set.
 pub fn train(request: TrainRequest, observer: &mut dyn Observer, stop: &AtomicBool) -> Result<TrainResult> {
     let started = Instant::now();
-    let TrainRequest { recordings, recipe, out, seed, cache_mib } = request;
+    let TrainRequest { recordings, recipe, out, seed, cache_mib, from } = request;
+    let start = from.as_ref().map(|from| Start::load(&from.model, from, &recipe, seed)).transpose()?;
     let data = Data::prepare(&recordings, &recipe, seed, cache_mib)?;
     let folder = RunFolder::create(&out)?;
     folder.write_recipe(&recipe)?;
@@ -101,10 +106,15 @@ pub fn train(request: TrainRequest, observer: &mut dyn Observer, stop: &AtomicBo
         recordings: recordings.iter().map(absolute).collect::<Result<_>>()?,
         cache_mib,
         rows_hash: data.rows_hash(),
+        transfer: start.as_ref().map(|start| start.transfer.clone()),
     };
+    if let Some(from) = &from {
+        let bytes = std::fs::read(&from.model).map_err(Error::io(&from.model))?;
+        atomic_file::write(&folder.from(), &bytes)?;
+    }
     data.write_split(&folder.file("split.csv"))?;
     folder.write_json("run.json", &info)?;
-    Session::new(folder, info, recipe, data, started)?.run(observer, stop)
+    Session::new(folder, info, recipe, data, start, started)?.run(observer, stop)
 }
 
 /// Goes on with the run in `path`, as if it had never stopped; prints the result again if it is finished.
@@ -134,7 +144,9 @@ pub fn resume(path: &Path, observer: &mut dyn Observer, stop: &AtomicBool) -> Re
         let message = "the recordings have changed since the run began; it can only go on with the same rows";
         return Err(Error::data(folder.file("run.json"), message));
     }
-    let mut session = Session::new(folder, info, recipe, data, started)?;
+    let from = info.transfer.as_ref().map(TransferRequest::of);
+    let start = from.map(|from| Start::load(&folder.from(), &from, &recipe, info.seed)).transpose()?;
+    let mut session = Session::new(folder, info, recipe, data, start, started)?;
     session.restore()?;
     session.run(observer, stop)
 }
@@ -155,12 +167,31 @@ struct Session {
 }
 
 impl Session {
-    fn new(folder: RunFolder, info: RunInfo, recipe: Recipe, data: Data, started: Instant) -> Result<Session> {
-        let network = recipe.network(Isa::best())?;
+    fn new(
+        folder: RunFolder,
+        info: RunInfo,
+        recipe: Recipe,
+        data: Data,
+        start: Option<Start>,
+        started: Instant,
+    ) -> Result<Session> {
+        let mut network = recipe.network(Isa::best())?;
+        if let Some(start) = &start {
+            network.freeze(&start.transfer.frozen)?;
+        }
         let optimizer = Optimizer::new(recipe.optimizer, recipe.clip_gradient_norm, &network);
-        let parameters = network.initialize(info.seed);
-        let (leak_percent, training_rows) = (data.leak_percent(), data.training_row_ids());
-        let notices = data.notices().to_vec();
+        let (leak_percent, mut training_rows) = (data.leak_percent(), data.training_row_ids());
+        let mut notices = data.notices().to_vec();
+        let parameters = match start {
+            Some(start) => {
+                notices.extend(start.notices(&recipe, &data));
+                training_rows.extend(start.rows);
+                training_rows.sort_unstable();
+                training_rows.dedup();
+                start.parameters
+            }
+            None => network.initialize(info.seed),
+        };
         let (training, validation) = data.into_loaders()?;
         // No batch is larger than a side has samples, whatever the recipe asks for.
         let most = training.samples().max(validation.as_ref().map_or(0, Loader::samples));
@@ -372,6 +403,7 @@ impl Session {
                 val_mse: record.val_mse,
                 val_center_mse: record.val_center_mse,
                 leak_percent: self.leak_percent,
+                transfer: self.info.transfer.clone(),
             },
             training_rows: self.training_rows.clone(),
         }

@@ -1,0 +1,271 @@
+//! ONNX files, for ONNX Runtime and everything else that reads them.
+//!
+//! The graph uses operators of opset 17 only, with a free batch dimension `N`. It takes either the preprocessed picture,
+//! `input` float `[N, c, h, w]`, or with the preprocessing in the graph the camera image, `image` uint8
+//! `[N, height, width, 3]` in RGB at the recipe's `source` size. It gives `steering` float `[N, 1]`.
+//!
+//! The metadata has `label` (the unit), `full_lock_deg`, `recipe` (TOML text) and `steersman_version`.
+
+mod graph;
+mod preprocessing;
+mod proto;
+
+use prost::Message;
+use steersman_kernels::Isa;
+
+use self::graph::{GraphBuilder, float, int, ints};
+use self::proto::{DataType, ModelProto, OperatorSetIdProto, StringStringEntryProto};
+use super::chain::{Op, Step, chain, fold_batch_norm};
+use crate::error::{Error, Result};
+use crate::model_file::{LABEL, Model};
+
+/// Version of the set of standard operators. ONNX Runtime reads it from 1.12 (2022) on.
+pub const OPSET: i64 = 17;
+
+/// Version of the file format that came with [`OPSET`].
+const IR_VERSION: i64 = 8;
+
+/// A protocol buffer must stay below 2 GiB; some bytes are left for what is no weight.
+const MAX_WEIGHT_BYTES: usize = (1 << 31) - (1 << 24);
+
+/// How to write an ONNX file.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct OnnxOptions {
+    /// Take the camera image instead of the preprocessed picture.
+    pub with_preprocessing: bool,
+    /// Merge batch normalisation into the layer before it.
+    pub fold_batch_norm: bool,
+}
+
+/// `model` as an ONNX file.
+///
+/// # Errors
+///
+/// [`Error::Network`] if the weights do not fit into a file of the format, naming the layer that is too much.
+pub fn onnx(model: &Model, options: OnnxOptions) -> Result<Vec<u8>> {
+    let recipe = &model.recipe;
+    let mut steps = chain(&recipe.network(Isa::PORTABLE)?, &model.parameters);
+    if options.fold_batch_norm {
+        steps = fold_batch_norm(steps);
+    }
+    check_size(&steps)?;
+
+    let mut graph = GraphBuilder::default();
+    let [c, h, w] = recipe.preprocessing.output();
+    if options.with_preprocessing {
+        let [height, width] = recipe.preprocessing.source;
+        graph.input("image", DataType::Uint8, &[height, width, 3], "camera image, RGB, row by row");
+        preprocessing::add(&mut graph, &recipe.preprocessing, "image", "input");
+    } else {
+        let doc = format!(
+            "preprocessed picture: grey level * {} + {}",
+            recipe.preprocessing.scale, recipe.preprocessing.offset
+        );
+        graph.input("input", DataType::Float, &[c, h, w], &doc);
+    }
+    network(&mut graph, &steps, "input", "steering");
+    graph.output("steering", DataType::Float, &[1], LABEL);
+
+    let entry = |key: &str, value: String| StringStringEntryProto { key: key.into(), value };
+    let model = ModelProto {
+        ir_version: IR_VERSION,
+        producer_name: "steersman".into(),
+        producer_version: env!("CARGO_PKG_VERSION").into(),
+        doc_string: recipe.about.clone(),
+        graph: Some(graph.finish(&recipe.name)),
+        opset_import: vec![OperatorSetIdProto { domain: String::new(), version: OPSET }],
+        metadata_props: vec![
+            entry("label", LABEL.into()),
+            entry("full_lock_deg", recipe.full_lock_deg.to_string()),
+            entry("recipe", recipe.to_toml()?),
+            entry("steersman_version", env!("CARGO_PKG_VERSION").into()),
+        ],
+    };
+    Ok(model.encode_to_vec())
+}
+
+fn check_size(steps: &[Step]) -> Result<()> {
+    let mut bytes = 0;
+    for step in steps {
+        bytes += 4 * match &step.op {
+            Op::Conv { weight, .. } | Op::Dense { weight, .. } => weight.len(),
+            Op::PRelu { slopes } => slopes.len(),
+            _ => 0,
+        };
+        if bytes > MAX_WEIGHT_BYTES {
+            let message = "with its weights the file would pass the 2 GiB that an ONNX file can have".into();
+            return Err(Error::Network { layer: step.name.clone(), message });
+        }
+    }
+    Ok(())
+}
+
+/// Adds the nodes of the network, which reads `input`, `[N, c, h, w]`, and gives `output`, `[N, 1]`.
+fn network(graph: &mut GraphBuilder, steps: &[Step], input: &str, output: &str) {
+    let mut value = input.to_string();
+    // A vector is [N, c] in ONNX, and [N, c, 1, 1] for the layers of maps.
+    let mut is_map = true;
+    for step in steps {
+        let takes = match step.op {
+            Op::Conv { .. } | Op::MaxPool { .. } | Op::AveragePool { .. } | Op::Crop { .. } | Op::ZeroPad { .. } => {
+                Some(true)
+            }
+            Op::Dense { .. } | Op::Flatten => Some(false),
+            _ => None,
+        };
+        match takes {
+            Some(true) if !is_map => {
+                let shape =
+                    graph.int64s(&format!("{}.map_shape", step.name), &[0, step.input.c, step.input.h, step.input.w]);
+                value = graph.node("Reshape", &format!("{}.map", step.name), &[&value, &shape], vec![]);
+            }
+            Some(false) if is_map => {
+                value = graph.node("Flatten", &format!("{}.vector", step.name), &[&value], vec![int("axis", 1)]);
+            }
+            _ => {}
+        }
+        is_map = takes.unwrap_or(is_map);
+        value = operation(graph, step, &value, is_map);
+    }
+    if is_map {
+        value = graph.node("Flatten", "vector", &[&value], vec![int("axis", 1)]);
+    }
+    graph.node("Identity", output, &[&value], vec![]);
+}
+
+/// Adds the nodes of one step; the name of its result.
+fn operation(graph: &mut GraphBuilder, step: &Step, x: &str, is_map: bool) -> String {
+    let Step { name, input, output, op } = step;
+    let constant = |what: &str| format!("{name}.{what}");
+    match op {
+        Op::Conv { kernel, stride, pads, weight, bias } => {
+            let weight = graph.floats(&constant("weight"), &[output.c, input.c, kernel[0], kernel[1]], weight);
+            let bias = graph.floats(&constant("bias"), &[output.c], bias);
+            let pads = ints("pads", &[pads.top, pads.left, pads.bottom, pads.right]);
+            let attributes = vec![ints("kernel_shape", kernel), ints("strides", stride), pads];
+            graph.node("Conv", name, &[x, &weight, &bias], attributes)
+        }
+        Op::Dense { weight, bias } => {
+            let weight = graph.floats(&constant("weight"), &[output.len(), input.len()], weight);
+            let bias = graph.floats(&constant("bias"), &[output.len()], bias);
+            graph.node("Gemm", name, &[x, &weight, &bias], vec![int("transB", 1)])
+        }
+        Op::BatchNorm { gamma, beta, mean, variance, epsilon } => {
+            let mut tensor = |what: &str, values: &[f32]| graph.floats(&constant(what), &[input.c], values);
+            let (gamma, beta) = (tensor("gamma", gamma), tensor("beta", beta));
+            let (mean, variance) = (tensor("running_mean", mean), tensor("running_variance", variance));
+            let inputs = [x, &gamma, &beta, &mean, &variance];
+            graph.node("BatchNormalization", name, &inputs, vec![float("epsilon", *epsilon)])
+        }
+        Op::Scale { factor, offset } => {
+            let factor = graph.floats(&constant("factor"), &[], &[*factor]);
+            let offset = graph.floats(&constant("offset"), &[], &[*offset]);
+            let scaled = graph.node("Mul", &constant("scaled"), &[x, &factor], vec![]);
+            graph.node("Add", name, &[&scaled, &offset], vec![])
+        }
+        Op::Relu => graph.node("Relu", name, &[x], vec![]),
+        Op::Elu { alpha } => graph.node("Elu", name, &[x], vec![float("alpha", *alpha)]),
+        Op::LeakyRelu { slope } => graph.node("LeakyRelu", name, &[x], vec![float("alpha", *slope)]),
+        Op::Tanh => graph.node("Tanh", name, &[x], vec![]),
+        Op::Softsign => graph.node("Softsign", name, &[x], vec![]),
+        Op::PRelu { slopes } => {
+            // The slopes are broadcast from the right.
+            let dims: &[usize] = match (is_map, slopes.len() == input.len()) {
+                (false, _) => &[input.c],
+                (true, true) => &[input.c, input.h, input.w],
+                (true, false) => &[input.c, 1, 1],
+            };
+            let slopes = graph.floats(&constant("slope"), dims, slopes);
+            graph.node("PRelu", name, &[x, &slopes], vec![])
+        }
+        Op::MaxPool { window, stride } => {
+            graph.node("MaxPool", name, &[x], vec![ints("kernel_shape", window), ints("strides", stride)])
+        }
+        Op::AveragePool { window, stride } => {
+            graph.node("AveragePool", name, &[x], vec![ints("kernel_shape", window), ints("strides", stride)])
+        }
+        Op::Crop { top, left } => {
+            let starts = graph.int64s(&constant("starts"), &[*top, *left]);
+            let ends = graph.int64s(&constant("ends"), &[top + output.h, left + output.w]);
+            let axes = graph.int64s(&constant("axes"), &[2, 3]);
+            graph.node("Slice", name, &[x, &starts, &ends, &axes], vec![])
+        }
+        Op::ZeroPad { top, left } => {
+            let (bottom, right) = (output.h - input.h - top, output.w - input.w - left);
+            let pads = graph.int64s(&constant("pads"), &[0, 0, *top, *left, 0, 0, bottom, right]);
+            graph.node("Pad", name, &[x, &pads], vec![])
+        }
+        Op::Flatten => x.into(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::HashSet;
+
+    use super::proto::GraphProto;
+    use super::*;
+    use crate::model_file::TrainingRecord;
+    use crate::recipe::{Recipe, SHIPPED};
+
+    fn model(name: &str) -> Model {
+        let recipe = Recipe::find(name, &[]).unwrap();
+        let parameters = recipe.network(Isa::PORTABLE).unwrap().initialize(1);
+        Model { recipe, parameters, record: TrainingRecord::default(), training_rows: vec![] }
+    }
+
+    fn decode(name: &str, options: OnnxOptions) -> (ModelProto, GraphProto) {
+        let decoded = ModelProto::decode(onnx(&model(name), options).unwrap().as_slice()).unwrap();
+        let graph = decoded.graph.clone().unwrap();
+        (decoded, graph)
+    }
+
+    #[test]
+    fn every_value_is_made_once_and_before_it_is_used() {
+        for (name, _) in SHIPPED {
+            for (with_preprocessing, fold_batch_norm) in [(false, false), (true, false), (true, true)] {
+                let (_, graph) = decode(name, OnnxOptions { with_preprocessing, fold_batch_norm });
+                let inputs = graph.input.iter().map(|input| input.name.as_str());
+                let mut known: HashSet<&str> = inputs.collect();
+                for constant in &graph.initializer {
+                    assert!(known.insert(&constant.name), "{name}: {} twice", constant.name);
+                }
+                for node in &graph.node {
+                    assert!(node.input.iter().all(|input| known.contains(input.as_str())), "{name}: {node:?}");
+                    assert!(node.output.iter().all(|output| known.insert(output)), "{name}: {node:?}");
+                }
+                assert!(known.contains("steering"), "{name}");
+            }
+        }
+    }
+
+    #[test]
+    fn inputs_are_as_asked_for_and_the_batch_is_free() {
+        for (with_preprocessing, expected) in [(false, vec![3, 40, 160]), (true, vec![160, 320, 3])] {
+            let (_, graph) = decode("hyper", OnnxOptions { with_preprocessing, fold_batch_norm: false });
+            let tensor = graph.input[0].r#type.clone().unwrap().tensor_type.unwrap();
+            let dims = tensor.shape.unwrap().dim;
+            assert_eq!(dims[0].dim_param.as_deref(), Some("N"));
+            assert_eq!(dims[1..].iter().map(|dim| dim.dim_value.unwrap()).collect::<Vec<_>>(), expected);
+        }
+    }
+
+    #[test]
+    fn batch_norm_is_folded_only_when_asked_for() {
+        let count = |fold_batch_norm| {
+            let (_, graph) = decode("hyper", OnnxOptions { with_preprocessing: false, fold_batch_norm });
+            graph.node.iter().filter(|node| node.op_type == "BatchNormalization").count()
+        };
+        assert_eq!((count(false), count(true)), (6, 0));
+    }
+
+    #[test]
+    fn the_metadata_says_how_to_use_it() {
+        let (decoded, _) = decode("lenet", OnnxOptions::default());
+        let entry = |key: &str| decoded.metadata_props.iter().find(|entry| entry.key == key).unwrap().value.clone();
+        assert_eq!(entry("full_lock_deg"), "25");
+        assert!(entry("label").contains("positive to the right"));
+        assert_eq!(Recipe::parse("metadata", &entry("recipe"), &[]).unwrap(), model("lenet").recipe);
+        assert_eq!(decoded.opset_import[0].version, OPSET);
+    }
+}

@@ -1,0 +1,91 @@
+//! A program in C99.
+
+use std::fmt::Write as _;
+
+use super::program::{Arg, Array, Buffer, Call, Program, Values, pick_sections, statement, wrap};
+
+const LIBRARY: &str = include_str!("library.c");
+
+/// The text of the file.
+pub fn write(program: &Program) -> String {
+    let mut text = String::new();
+    // Writing to a String cannot fail.
+    let _ = write_to(&mut text, program);
+    text
+}
+
+fn write_to(text: &mut String, program: &Program) -> std::fmt::Result {
+    let recipe = program.recipe;
+    let [height, width] = recipe.preprocessing.source;
+    let kib = program.buffers.iter().map(|(buffer, len)| len * if buffer.holds_bytes() { 1 } else { 4 }).sum::<usize>();
+    writeln!(
+        text,
+        "/*\n * Recipe {}, written by steersman {}. C99, needs no library.\n *\n * \
+         steer(image) gives the steering for a camera image: roughly in [-1, 1], positive to the right, not clamped; times\n * \
+         STEER_FULL_LOCK_DEG it is degrees of the front wheels. The image is {height} rows of {width} pixels, each red, green, \
+         blue.\n * \
+         An image of another size has to be scaled to that before. The buffers below are {} KiB, so only one thread\n * \
+         at a time may call it; nothing is allocated.\n */",
+        recipe.name,
+        env!("CARGO_PKG_VERSION"),
+        kib.div_ceil(1024)
+    )?;
+    writeln!(text, "#include <stdint.h>\n")?;
+    writeln!(text, "#define STEER_HEIGHT {height}\n#define STEER_WIDTH {width}")?;
+    writeln!(text, "#define STEER_FULL_LOCK_DEG {:?}\n", recipe.full_lock_deg)?;
+    writeln!(text, "float steer(const uint8_t image[STEER_HEIGHT * STEER_WIDTH * 3]);\n")?;
+    for array in &program.tables {
+        write_array(text, array)?;
+    }
+    if !program.constants.is_empty() {
+        let constants: Vec<_> = program.constants.iter().map(|(name, value)| format!("{name} = {value}")).collect();
+        writeln!(text, "enum {{ {} }};\n", constants.join(", "))?;
+    }
+    text.push_str(&pick_sections(LIBRARY, &program.sections));
+    for array in &program.arrays {
+        write_array(text, array)?;
+    }
+    for (buffer, len) in &program.buffers {
+        let kind = if buffer.holds_bytes() { "uint8_t" } else { "float" };
+        writeln!(text, "static {kind} {}[{len}];", buffer.name())?;
+    }
+    writeln!(text, "\nfloat steer(const uint8_t image[STEER_HEIGHT * STEER_WIDTH * 3]) {{")?;
+    for Call { comment, function, args } in &program.calls {
+        if let Some(comment) = comment {
+            writeln!(text, "    /* {comment} */")?;
+        }
+        let args: Vec<String> = args.iter().map(argument).collect();
+        writeln!(text, "{}", statement(function, &args, "    "))?;
+    }
+    writeln!(text, "    return {}[0];\n}}", program.result.name())
+}
+
+fn write_array(text: &mut String, Array { name, values }: &Array) -> std::fmt::Result {
+    let (kind, len, numbers) = match values {
+        Values::F32(values) => ("float", values.len(), wrap(values.iter().map(|value| format!("{value:?}f")))),
+        Values::I32(values) => ("int32_t", values.len(), wrap(values.iter().map(i32::to_string))),
+        Values::U16(values) => ("uint16_t", values.len(), wrap(values.iter().map(u16::to_string))),
+    };
+    writeln!(text, "static const {kind} {name}[{len}] = {{\n{numbers}\n}};\n")
+}
+
+fn argument(arg: &Arg) -> String {
+    let from = |buffer: &Buffer, offset: &usize| match offset {
+        0 => buffer.name().to_string(),
+        offset => format!("{} + {offset}", buffer.name()),
+    };
+    match arg {
+        Arg::Image(range) if range.start == 0 => "image".into(),
+        Arg::Image(range) => format!("image + {}", range.start),
+        Arg::Read(buffer, offset) | Arg::Write(buffer, offset) => from(buffer, offset),
+        Arg::Change(buffer, len) => format!("{}, {len}", buffer.name()),
+        Arg::Array(name) => name.clone(),
+        Arg::Int(value) => value.to_string(),
+        Arg::Float(value) => format!("{value:?}f"),
+        Arg::Sizes(name, fields) => {
+            let fields: Vec<_> = fields.iter().map(|(field, value)| format!(".{field} = {value}")).collect();
+            format!("(struct {name}){{{}}}", fields.join(", "))
+        }
+        Arg::Function(name) => name.to_string(),
+    }
+}

@@ -1,0 +1,61 @@
+//! Source code with the weights in it, in C99 or Rust: one file that needs nothing else.
+//!
+//! The file holds the preprocessing, the network and the buffers, so that memory is bounded and nothing is allocated. A model
+//! becomes a [`Program`](program::Program), the same for both languages: arrays and calls of the functions in `library.c` or
+//! `library.rs`, of which the file gets those that it calls. Batch normalisation is folded into the layer before it.
+
+mod c;
+mod program;
+mod rust;
+
+use steersman_kernels::Isa;
+
+use super::chain::{Op, Step, chain, fold_batch_norm};
+use crate::error::{Error, Result};
+use crate::model_file::Model;
+
+/// A language that models are written in.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Language {
+    /// C99 without warnings under `-Wall -Wextra -pedantic`.
+    C,
+    /// Rust of edition 2021 or later, without `std` and without `unsafe`.
+    Rust,
+}
+
+/// Most numbers of a layer; a source file has about 12 characters for each, and compilers take long over larger ones.
+const MAX_NUMBERS: usize = 1 << 22;
+
+/// `model` as one source file.
+///
+/// # Errors
+///
+/// [`Error::Network`] names a layer with more weights than a source file can sensibly hold.
+pub fn source(model: &Model, language: Language) -> Result<String> {
+    let steps = fold_batch_norm(chain(&model.recipe.network(Isa::PORTABLE)?, &model.parameters));
+    for Step { name, op, .. } in &steps {
+        let numbers = match op {
+            Op::Conv { weight, .. } | Op::Dense { weight, .. } => weight.len(),
+            Op::PRelu { slopes } => slopes.len(),
+            _ => 0,
+        };
+        let arrays: &[&[f32]] = match op {
+            Op::Conv { weight, bias, .. } | Op::Dense { weight, bias } => &[weight, bias],
+            _ => &[],
+        };
+        if arrays.iter().any(|values| values.iter().any(|value| !value.is_finite())) {
+            let message = "with batch normalisation folded in, its weights are not finite".into();
+            return Err(Error::Network { layer: name.clone(), message });
+        }
+        if numbers > MAX_NUMBERS {
+            let message =
+                format!("{numbers} weights are too many for a source file (at most {MAX_NUMBERS}); export to onnx");
+            return Err(Error::Network { layer: name.clone(), message });
+        }
+    }
+    let program = program::Program::new(&model.recipe, &steps);
+    Ok(match language {
+        Language::C => c::write(&program),
+        Language::Rust => rust::write(&program),
+    })
+}
