@@ -283,7 +283,7 @@ pub fn record(
     if !(5.0..=30.0).contains(&options.speed_mph) {
         return Err(Error::Usage(format!("speed {} mph: 5 to 30 mph can be recorded", options.speed_mph)));
     }
-    if options.hz == 0 || STEPS_PER_S % options.hz != 0 {
+    if options.hz == 0 || !STEPS_PER_S.is_multiple_of(options.hz) {
         return Err(Error::Usage(format!("{} rows a second: 1, 2, 5, 10, 25 or 50 can be recorded", options.hz)));
     }
     let samples = drive_expert(track, options);
