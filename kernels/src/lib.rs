@@ -13,7 +13,8 @@
 //!
 //! # Where things are
 //! [`isa`] detection · [`gemm`] matrix product · [`im2col`] image to patch matrix and back · [`conv`] convolution and
-//! its gradients · [`pool`] · [`activation`] · [`norm`] batch normalisation · [`update`] optimiser steps ·
+//! its gradients · [`pool`] · [`activation`] · [`norm`] batch normalisation · [`norm_rectify`] the same with what follows it, in one pass ·
+//! [`update`] optimiser steps ·
 //! [`pixels`] bytes to floats · [`peak`] what the core can do at best · [`mod@reference`] the naive loops that define
 //! each kernel.
 #![deny(unsafe_op_in_unsafe_fn)]
