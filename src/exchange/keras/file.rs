@@ -18,6 +18,9 @@ const MAX_FILE_BYTES: u64 = 1 << 30;
 /// How many times longer than the file its unpacked content may be. Weights hardly shrink.
 const INFLATION: usize = 16;
 
+/// Characters of a tensor's name that messages show.
+const MAX_NAME: usize = 100;
+
 /// An opened file.
 pub(super) struct KerasFile {
     /// The architecture's JSON, if the file has one.
@@ -222,6 +225,8 @@ impl Weights {
                 let last = parts.pop().unwrap_or_default();
                 let dataset = parts.iter().try_fold(layer.clone(), |group, part| group.group(part));
                 let dataset = dataset.and_then(|group| group.dataset(last));
+                // A hostile name is as long as an attribute; messages are not.
+                let name: String = name.chars().take(MAX_NAME).collect();
                 let dataset = dataset.map_err(|e| format!("tensor `{name}` of `{}`: {e}", layer.name()))?;
                 Ok(Tensor { name, dataset })
             };
