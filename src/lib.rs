@@ -6,8 +6,9 @@
 //! A frame's way to the wheels: [`dataset`] reads a recording, splits it *before* anything is augmented, decodes each image
 //! once and preprocesses it; a [`recipe`] says how, and what network to train; [`network`] plans the buffers of its
 //! [`layers`] and runs them; [`training`] goes through the epochs, follows the gradient with an [`optimizer`] and writes the
-//! run folder; [`model_file`] is what remains; a [`pilot`] loads it and steers, and [`exchange`] writes it down for others. [`report`] measures how well it predicts,
-//! and [`simulator`] how well it drives. [`cli`] is the command line.
+//! run folder; [`model_file`] is what remains; a [`pilot`] loads it and steers. [`report`] measures how well it predicts,
+//! and [`simulator`] how well it drives. [`exchange`] reads models of other programs and writes ours for them. [`cli`] is
+//! the command line.
 //!
 //! Dependencies point one way: `steersman-kernels` (all vector code and every `unsafe` line) ← [`tensor`] ← [`layers`] ←
 //! [`network`] (with the [`loss`]) ← [`optimizer`] ← [`training`]; [`dataset`] and [`simulator`] know no network.

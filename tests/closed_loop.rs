@@ -4,8 +4,11 @@
 #![cfg(not(debug_assertions))]
 
 use std::path::Path;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, Ordering};
 
+use steersman::Error;
+use steersman::main_job::experiment::{self, Plan, Subject, write_csv};
+use steersman::main_job::job::{Job, JobNote, JobRequest, Scope, Stages};
 use steersman::main_job::training_set::{Take, recordings};
 use steersman::main_job::{TrackResult, test_on_track};
 use steersman::pilot::Pilot;
@@ -66,4 +69,110 @@ fn what_is_learned_from_the_expert_drives_and_does_so_alike_for_any_number_of_th
     assert_eq!(again.weights_hash, result.weights_hash);
     assert_eq!(same_lake.offline_mae_deg, lake.offline_mae_deg);
     assert_eq!(same_lake.drive.cte_rms_m, lake.drive.cte_rms_m);
+}
+
+/// Sets a flag at the end of the first epoch.
+struct StopsAfterAnEpoch<'a>(&'a AtomicBool);
+
+impl Observer for StopsAfterAnEpoch<'_> {
+    fn notice(&mut self, _: &str) {}
+    fn progress(&mut self, _: u32, _: usize, _: usize) {}
+    fn epoch(&mut self, _: &EpochRecord, _: u32) {
+        self.0.store(true, Ordering::Relaxed);
+    }
+}
+
+impl Stages for Silent {
+    fn begin(&self, _: &str) -> Box<dyn Fn(f64) + Sync> {
+        Box::new(|_| {})
+    }
+    fn notice(&self, _: &str) {}
+}
+
+fn small_scope(folder: &Path) -> Scope {
+    let take = |recovery, seed| Take { track: "lake".into(), laps: 0.05, reverse: false, recovery, seed };
+    Scope {
+        recordings: folder.join("recordings"),
+        takes: vec![take(false, 1), take(true, 2)],
+        tracks: vec!["lake".into()],
+    }
+}
+
+fn lenet(epochs: u32) -> Recipe {
+    Recipe::find("lenet", &[format!("epochs={epochs}"), "split.validation_share=0.3".into()]).unwrap()
+}
+
+#[test]
+fn a_job_that_was_stopped_goes_on_through_dagger_to_the_drives() {
+    let folder = tempfile::tempdir().unwrap();
+    let never = AtomicBool::new(false);
+    let note = JobNote { runs: 1, dagger_rounds: 1, round: 0 };
+    let request = |name: &str| JobRequest { recipe: lenet(2), out: folder.path().join(name), seed: 5, cache_mib: 64 };
+    let (mut watcher, scope) = (Silent, small_scope(folder.path()));
+    let mut whole = Job::new(scope.clone(), note.clone(), &mut watcher, &Silent, &never);
+    let expected = whole.begin(request("whole")).unwrap();
+    assert_eq!(whole.folder().unwrap(), folder.path().join("whole-dagger-1"));
+    assert_eq!((expected.drives.len(), expected.drives[0].drive.track.as_str()), (1, "lake"));
+    assert!(folder.path().join("whole/dagger/lake/driving_log.csv").is_file());
+    let saved = std::fs::read_to_string(folder.path().join("whole-dagger-1/drives.json")).unwrap();
+    assert!(saved.contains("\"track\": \"lake\"") && saved.contains("offline_mae_deg"), "{saved}");
+    let last_note = JobNote::read(&folder.path().join("whole-dagger-1")).unwrap();
+    assert_eq!(last_note, Some(JobNote { round: 1, ..note.clone() }));
+
+    let stop = AtomicBool::new(false);
+    let mut stopper = StopsAfterAnEpoch(&stop);
+    let mut stopped = Job::new(scope.clone(), note.clone(), &mut stopper, &Silent, &stop);
+    assert!(matches!(stopped.begin(request("stopped")), Err(Error::Interrupted)));
+    let path = stopped.folder().unwrap().to_path_buf();
+    assert_eq!(path, folder.path().join("stopped"));
+    let note = JobNote::read(&path).unwrap().unwrap();
+    let mut watcher = Silent;
+    let result = Job::new(scope.clone(), note.clone(), &mut watcher, &Silent, &never).go_on(&path).unwrap();
+    assert_eq!(result.training.weights_hash, expected.training.weights_hash);
+    assert_eq!(result.drives[0].drive.cte_rms_m, expected.drives[0].drive.cte_rms_m);
+
+    // What is there is not overwritten, and that is said before anything is done.
+    let mut watcher = Silent;
+    let again = Job::new(scope, note, &mut watcher, &Silent, &never).begin(request("stopped"));
+    assert!(again.unwrap_err().to_string().contains("stopped is not empty"));
+}
+
+#[test]
+fn the_experiments_train_and_drive_every_variant() {
+    let folder = tempfile::tempdir().unwrap();
+    let scope = small_scope(folder.path());
+    let recordings = recordings(&scope.recordings, &scope.takes, &|_| true).unwrap().0;
+    let go = |subject, stop: &AtomicBool| {
+        let plan = Plan {
+            subject,
+            recipe: lenet(1),
+            seeds: 2,
+            recordings: recordings.clone(),
+            tracks: scope.tracks.clone(),
+            runs: 1,
+            cache_mib: 64,
+        };
+        let mut told = 0;
+        let trials = experiment::run(&plan, &mut Silent, &Silent, stop, &mut |_| {
+            told += 1;
+            Ok(())
+        });
+        (trials, told)
+    };
+    let never = AtomicBool::new(false);
+    let (trials, told) = go(Subject::Split, &never);
+    let trials = trials.unwrap();
+    let variants: Vec<_> = trials.iter().map(|t| (t.variant.as_str(), t.seed)).collect();
+    let expected =
+        [("blocks", 1), ("blocks", 2), ("random", 1), ("random", 2), ("random-images", 1), ("random-images", 2)];
+    assert!(variants == expected && told == 6, "{variants:?}");
+    assert!(trials.iter().all(|t| t.laps_total == 1 && t.fresh_mae_deg > 0.0 && t.val_center_mse.is_some()));
+    // Single rows have neighbours on the other side, blocks have not.
+    assert!(trials[0].leak_percent < 5.0 && trials[2].leak_percent > 95.0, "{trials:?}");
+    let csv = folder.path().join("split.csv");
+    write_csv(&csv, &trials).unwrap();
+    let text = std::fs::read_to_string(csv).unwrap();
+    assert!(text.starts_with("variant,seed,leak_percent,val_center_mse,") && text.lines().count() == 7, "{text}");
+
+    assert!(matches!(go(Subject::Colour, &AtomicBool::new(true)).0, Err(Error::Interrupted)));
 }

@@ -9,7 +9,7 @@ use super::share_bar::Bars;
 use super::{RecipeArgs, or_dash, pool, print_json, stop_on_ctrl_c};
 use crate::error::{Error, Result};
 use crate::main_job::experiment::{self, Plan, Subject, Trial, takes, write_csv};
-use crate::main_job::job::training_set;
+use crate::main_job::job::{RECORDINGS, training_set};
 use crate::simulator::Track;
 
 /// Compare splits or colour spaces: what the validation loss promises beside what the drive delivers
@@ -83,7 +83,7 @@ pub fn run(args: ExperimentArgs) -> Result<()> {
     let stop = stop_on_ctrl_c()?;
     let (pool, bars, mut progress) = (pool(args.threads)?, Bars, Progress::new());
     let recordings = match args.recordings.is_empty() {
-        true => pool.install(|| training_set(&takes(args.random_tracks), &bars, &stop))?,
+        true => pool.install(|| training_set(RECORDINGS.as_ref(), &takes(args.random_tracks), &bars, &stop))?,
         false => args.recordings,
     };
     let subject = match args.subject {

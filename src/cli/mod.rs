@@ -10,6 +10,7 @@ mod evaluate;
 mod experiment;
 mod explain;
 mod export;
+mod import;
 mod inspect;
 mod predict;
 mod progress;
@@ -60,6 +61,7 @@ enum Command {
     Compare(compare::CompareArgs),
     Summary(summary::SummaryArgs),
     Bench(bench::BenchArgs),
+    Import(import::ImportArgs),
 }
 
 /// Runs the command line of this process.
@@ -81,6 +83,7 @@ pub fn main() -> ExitCode {
         Command::Compare(args) => compare::run(args),
         Command::Summary(args) => summary::run(args),
         Command::Bench(args) => bench::run(args, started),
+        Command::Import(args) => import::run(args),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,

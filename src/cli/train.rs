@@ -10,7 +10,7 @@ use super::share_bar::Bars;
 use super::{RecipeArgs, or_dash, pool, print_json, stop_on_ctrl_c};
 use crate::error::{Error, Result};
 use crate::main_job::held_out::trained_on_held_out;
-use crate::main_job::job::{Job, JobNote, JobRequest};
+use crate::main_job::job::{Job, JobNote, JobRequest, Scope};
 use crate::main_job::{MainJobResult, TrackResult, held_out};
 use crate::report;
 use crate::training::{self, RunFolder, TrainRequest, TrainResult, TransferRequest};
@@ -76,7 +76,7 @@ pub fn run(args: TrainArgs) -> Result<()> {
     };
     if let Some(note) = note {
         let bars = Bars;
-        let mut job = Job::new(note, &mut progress, &bars, &stop);
+        let mut job = Job::new(Scope::default(), note, &mut progress, &bars, &stop);
         let result = match args.resume {
             Some(folder) => pool.install(|| job.go_on(&folder)),
             None => {

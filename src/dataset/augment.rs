@@ -1,11 +1,11 @@
-//! Random changes to training images: a horizontal shift, a shadow, colours, brightness. Validation and driving never see
+//! Random changes to training images: a horizontal shift, shadows, lines, colours, brightness. Validation and driving never see
 //! them.
 //!
-//! They act on the RGB stage of preprocessing (cropped, before the colour conversion), in this order: shift, shadow,
-//! colours, brightness. Each is drawn anew for every sample and epoch.
+//! They act on the RGB stage of preprocessing (cropped, before the colour conversion), in this order: shift, shadows,
+//! lines, colours, brightness. Each is drawn anew for every sample and epoch.
 
 use super::preprocess::Preprocessing;
-use crate::random::{uniform, unit};
+use crate::random::{below, uniform, unit};
 use crate::{Error, Result};
 use rand::Rng;
 use serde::{Deserialize, Serialize};
@@ -19,8 +19,15 @@ pub struct Augmentation {
     pub brightness: Option<[f64; 2]>,
     /// Probability of a shadow: one side of a random line from the top to the bottom edge is darkened.
     pub shadow_probability: f64,
-    /// Range of the factor that grey levels in the shadow are multiplied by; smaller is darker.
+    /// Probability of a shadow that falls across: a band between the left and the right edge, as of a tree or a post.
+    pub band_probability: f64,
+    /// Range of the factor that grey levels in a shadow are multiplied by; smaller is darker.
     pub shadow_strength: [f64; 2],
+    /// Largest number of straight lines across the picture that are darkened or lightened: seams, wires, wheel tracks, of which
+    /// none is the edge of the road.
+    pub lines: u32,
+    /// Range of the factor that grey levels in a line are multiplied by (clamped at 255).
+    pub line_strength: [f64; 2],
     /// Largest shift to the left or right, in source pixels. The edge column fills what comes into view.
     pub shift_px: f64,
     /// Steering added for each source pixel that the picture moves to the right: the road seems to lie to the right,
@@ -45,7 +52,10 @@ impl Default for Augmentation {
         Self {
             brightness: None,
             shadow_probability: 0.0,
+            band_probability: 0.0,
             shadow_strength: [0.2, 0.5],
+            lines: 0,
+            line_strength: [0.4, 1.6],
             shift_px: 0.0,
             shift_steering_per_px: None,
             hue_deg: 0.0,
@@ -59,7 +69,12 @@ impl Default for Augmentation {
 impl Augmentation {
     /// Whether anything is changed at all.
     pub fn is_active(&self) -> bool {
-        self.brightness.is_some() || self.shadow_probability > 0.0 || self.shift_px > 0.0 || self.changes_colours()
+        self.brightness.is_some()
+            || self.band_probability > 0.0
+            || self.shadow_probability > 0.0
+            || self.shift_px > 0.0
+            || self.lines > 0
+            || self.changes_colours()
     }
 
     fn changes_colours(&self) -> bool {
@@ -76,6 +91,7 @@ impl Augmentation {
         let ranges = [
             ("brightness", self.brightness),
             ("shadow_strength", Some(self.shadow_strength)),
+            ("line_strength", Some(self.line_strength)),
             ("saturation", self.saturation),
             ("tint", self.tint),
             ("contrast", self.contrast),
@@ -83,11 +99,17 @@ impl Augmentation {
         if let Some((key, _)) = ranges.into_iter().find(|(_, range)| !range.is_none_or(is_range)) {
             return wrong(key, "must be [low, high] with 0 <= low <= high <= 10");
         }
+        if self.lines > 100 {
+            return wrong("lines", "must be 0 to 100");
+        }
         if !(0.0..=180.0).contains(&self.hue_deg) {
             return wrong("hue_deg", "must be 0 to 180");
         }
         if !(0.0..=1.0).contains(&self.shadow_probability) {
             return wrong("shadow_probability", "must be 0 to 1");
+        }
+        if !(0.0..=1.0).contains(&self.band_probability) {
+            return wrong("band_probability", "must be 0 to 1");
         }
         if !(0.0..=1000.0).contains(&self.shift_px) {
             return wrong("shift_px", "must be 0 to 1000 source pixels");
@@ -116,6 +138,22 @@ impl Augmentation {
             if chance < self.shadow_probability {
                 shadow(rgb, width, top, bottom, side < 0.5, &factors(factor));
             }
+        }
+        if self.band_probability > 0.0 {
+            let [chance, from, length, height, thickness] = [(); 5].map(|()| unit(rng));
+            let tilt = uniform(rng, -0.5, 0.5);
+            let factor = uniform(rng, self.shadow_strength[0], self.shadow_strength[1]);
+            if chance < self.band_probability {
+                let band =
+                    Band { from: from - 0.3, length: 0.3 + length, height, tilt, thickness: 0.02 + 0.23 * thickness };
+                band.darken(rgb, width, &factors(factor));
+            }
+        }
+        for _ in 0..below(rng, self.lines as usize + 1) {
+            // From anywhere at the horizon or beside the picture to anywhere near the car.
+            let [top, bottom, wide] = [unit(rng), uniform(rng, -1.0, 2.0), unit(rng)];
+            let table = factors(uniform(rng, self.line_strength[0], self.line_strength[1]));
+            line(rgb, width, top, bottom, wide, &table);
         }
         if self.changes_colours() {
             let drawn = |range: Option<[f64; 2]>, rng: &mut _| {
@@ -168,6 +206,48 @@ fn shadow(rgb: &mut [u8], width: usize, top: f64, bottom: f64, left: bool, table
         let (before, after) = row.split_at_mut(edge);
         let dark = if left { before } else { after };
         dark.iter_mut().for_each(|grey| *grey = table[usize::from(*grey)]);
+    }
+}
+
+/// A band across the picture, in shares of its width and height.
+struct Band {
+    /// Where it begins, from the left edge.
+    from: f64,
+    /// How far it reaches to the right.
+    length: f64,
+    /// Its middle at the left edge, from the top.
+    height: f64,
+    /// How much lower its middle is at the right edge.
+    tilt: f64,
+    /// From its upper to its lower rim.
+    thickness: f64,
+}
+
+impl Band {
+    fn darken(&self, rgb: &mut [u8], width: usize, table: &[u8; 256]) {
+        let rows = rgb.len() / (width * 3);
+        let column_at = |share: f64| ((share * width as f64).round().max(0.0) as usize).min(width);
+        for x in column_at(self.from)..column_at(self.from + self.length) {
+            let middle = self.height + self.tilt * (x as f64 + 0.5) / width as f64;
+            let row_at = |share: f64| ((share * rows as f64).round().max(0.0) as usize).min(rows);
+            for y in row_at(middle - 0.5 * self.thickness)..row_at(middle + 0.5 * self.thickness) {
+                let at = (y * width + x) * 3;
+                rgb[at..at + 3].iter_mut().for_each(|grey| *grey = table[usize::from(*grey)]);
+            }
+        }
+    }
+}
+
+/// Darkens or lightens a line from `top` at the upper rim to `bottom` at the lower, both shares of the width. It is drawn in
+/// perspective: fine above, up to 4 pixels wide below for `wide` 1.
+fn line(rgb: &mut [u8], width: usize, top: f64, bottom: f64, wide: f64, table: &[u8; 256]) {
+    let rows = rgb.len() / (width * 3);
+    for (y, row) in rgb.chunks_exact_mut(width * 3).enumerate() {
+        let along = (y as f64 + 0.5) / rows as f64;
+        let from = (top + (bottom - top) * along) * width as f64;
+        let to = from + 0.7 + 3.3 * wide * along;
+        let [from, to] = [from, to].map(|column| column.round().clamp(0.0, width as f64) as usize * 3);
+        row[from..to].iter_mut().for_each(|grey| *grey = table[usize::from(*grey)]);
     }
 }
 
@@ -252,6 +332,43 @@ mod tests {
         }
         // A line near the border can leave the picture as it is, so a few less than 500.
         assert!((400..=560).contains(&shadows), "{shadows}");
+    }
+
+    #[test]
+    fn bands_darken_what_lies_between_their_rims() {
+        let mut rgb = vec![100; 4 * 10 * 3];
+        let band = Band { from: 0.3, length: 0.5, height: 0.25, tilt: 0.5, thickness: 0.5 };
+        band.darken(&mut rgb, 10, &factors(0.5));
+        let dark = |y: usize| (0..10).filter(|x| rgb[(y * 10 + x) * 3] == 50).collect::<Vec<_>>();
+        // Columns 3 to 7; two of four rows, lower to the right: the middle is at 0.25 + 0.05 (x + 0.5).
+        assert_eq!([dark(0), dark(1), dark(2), dark(3)], [vec![], vec![3, 4, 5, 6], vec![3, 4, 5, 6, 7], vec![7]]);
+        let bands = Augmentation { band_probability: 0.5, shadow_strength: [0.5, 0.5], ..Default::default() };
+        assert!(bands.is_active() && bands.validate().is_ok());
+        let mut seen = 0;
+        for stream in 0..1000 {
+            let mut rgb = vec![100; 4 * 10 * 3];
+            assert_eq!(bands.apply(&preprocessing(), &mut rgb, &mut rng(4, Purpose::Test, 0, stream)), 0.0);
+            seen += usize::from(rgb.contains(&50));
+        }
+        // Thin bands and those beside the picture may touch no pixel.
+        assert!((250..=520).contains(&seen), "{seen}");
+    }
+
+    #[test]
+    fn lines_are_narrow_and_not_more_than_asked_for() {
+        let lines = Augmentation { lines: 2, line_strength: [0.5, 0.5], ..Default::default() };
+        assert!(lines.is_active());
+        let mut seen = std::collections::BTreeSet::new();
+        for stream in 0..500 {
+            let mut rgb = vec![100; 4 * 10 * 3];
+            assert_eq!(lines.apply(&preprocessing(), &mut rgb, &mut rng(3, Purpose::Test, 0, stream)), 0.0);
+            // Where two lines cross, grey levels are halved twice.
+            assert!(rgb.iter().all(|grey| [100, 50, 25].contains(grey)));
+            let dark = rgb.chunks_exact(30).map(|row| row.iter().filter(|&&grey| grey < 100).count() / 3).max();
+            assert!(dark <= Some(8), "{dark:?}");
+            seen.insert(dark);
+        }
+        assert!(seen.contains(&Some(0)) && seen.len() > 3, "{seen:?}");
     }
 
     #[test]

@@ -1,8 +1,11 @@
-//! Models for other programs: ONNX files, and source code that needs nothing else.
+//! Models from and for other programs: [`keras`] reads old models, with [`presets`] and [`fit`] for the preprocessing that their
+//! files do not hold; [`onnx`] and [`source`] write ours as ONNX files and as source code that needs nothing else.
 //!
-//! Every export begins with the network as a [`chain`] of operations without training; [`onnx`] and [`source`] write it down,
-//! together with the preprocessing.
+//! Every export begins with the network as a chain of operations without training.
 
 pub(crate) mod chain;
+pub mod fit;
+pub mod keras;
 pub mod onnx;
+pub mod presets;
 pub mod source;

@@ -63,12 +63,11 @@ impl NormRectify {
         norm_rectify::forward(self.isa, &self.shape, n, x, scale, shift, self.rectifier(params), y);
     }
 
-    /// Overwrites `sums` with what [`BatchStatistics::finish_backward`] wants of the `n` images, and adds to `dparams`.
+    /// Overwrites `sums` with what [`BatchStatistics::finish_backward`] wants of the images in `x`, and adds to `dparams`.
     pub fn backward_sums(
         &self,
         params: &[f32],
         moments: &[f32],
-        n: usize,
         x: &[f32],
         dy: &[f32],
         sums: &mut [f64],
@@ -76,6 +75,7 @@ impl NormRectify {
     ) {
         let (dnorm, dslopes) = dparams.split_at_mut(self.norm_len());
         let statistics = channel_statistics(&self.norm.split(moments));
+        let n = x.len() / self.norm.input().len();
         sums.fill(0.0);
         let slopes = self.rectifier(params);
         norm_rectify::backward_sums(self.isa, &self.shape, n, x, dy, statistics, slopes, sums, dslopes);

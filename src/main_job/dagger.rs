@@ -2,17 +2,17 @@
 
 use std::path::{Path, PathBuf};
 
-use super::training_set::{self, Take, record_takes};
+use super::training_set::{Take, record_takes};
 use crate::error::{Error, Result};
 use crate::pilot::Pilot;
 use crate::simulator::recorder::{drive_and_label, write_recording};
 
-/// Shortest takes of the training set teach as much when the model drives them, and cost less.
+/// What the model drives of each take of the training set.
 const LAPS: f64 = 0.5;
 
-/// What is driven in `round` (from 1): the plain takes of the training set, shorter, with other starts and light.
-pub fn takes(round: u32) -> Vec<Take> {
-    let plain = training_set::takes().into_iter().filter(|take| !take.recovery);
+/// What is driven in `round` (from 1): the plain ones of `takes`, shorter, with other starts and light.
+fn takes_of_round(takes: &[Take], round: u32) -> Vec<Take> {
+    let plain = takes.iter().filter(|take| !take.recovery).cloned();
     plain.map(|take| Take { laps: LAPS * take.laps, seed: take.seed + 1000 * u64::from(round), ..take }).collect()
 }
 
@@ -22,19 +22,20 @@ fn expert_share(round: u32) -> f64 {
     0.5f64.powi(round.min(60) as i32)
 }
 
-/// The recordings of `round` in the folder `out`, driven by `pilot`, labelled by the expert; recorded first if `out` is not
-/// there yet.
+/// The recordings of `round` in the folder `out`: the plain ones of `takes`, driven by `pilot`, labelled by the expert;
+/// recorded first if `out` is not there yet.
 ///
 /// # Errors
 ///
-/// As [`training_set::recordings`].
+/// As [`super::training_set::recordings`].
 pub fn recordings(
     pilot: &Pilot,
+    takes: &[Take],
     out: &Path,
     round: u32,
     progress: &(dyn Fn(f64) -> bool + Sync),
 ) -> Result<Vec<PathBuf>> {
-    let takes = takes(round);
+    let takes = takes_of_round(takes, round);
     if !out.exists() {
         let parent = out.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
         let unfinished =
@@ -55,7 +56,8 @@ mod tests {
 
     #[test]
     fn every_round_drives_other_takes_and_leans_less_on_the_expert() {
-        let (first, second) = (takes(1), takes(2));
+        let all = super::super::training_set::takes();
+        let (first, second) = (takes_of_round(&all, 1), takes_of_round(&all, 2));
         assert!(first.iter().zip(&second).all(|(a, b)| a.seed != b.seed && a.track == b.track && !a.recovery));
         assert_eq!([1, 2].map(expert_share), [0.5, 0.25]);
     }

@@ -7,7 +7,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::{MainJobResult, TRACKS, TrackResult, dagger, test_on_track, training_set};
+use super::training_set::{self, Take};
+use super::{MainJobResult, TRACKS, TrackResult, dagger, test_on_track};
 use crate::atomic_file;
 use crate::error::{Error, Result};
 use crate::pilot::Pilot;
@@ -47,10 +48,13 @@ impl JobNote {
 
     fn write(&self, folder: &Path) -> Result<()> {
         std::fs::create_dir_all(folder).map_err(Error::io(folder))?;
-        let path = folder.join(RunFolder::JOB_NOTE);
-        let text = serde_json::to_string_pretty(self).map_err(|e| Error::data(&path, e.to_string()))?;
-        atomic_file::write(&path, (text + "\n").as_bytes())
+        write_json(&folder.join(RunFolder::JOB_NOTE), self)
     }
+}
+
+fn write_json(path: &Path, value: &impl Serialize) -> Result<()> {
+    let text = serde_json::to_string_pretty(value).map_err(|e| Error::data(path, e.to_string()))?;
+    atomic_file::write(path, (text + "\n").as_bytes())
 }
 
 /// Whoever watches the parts of the job that know the share they have done.
@@ -61,8 +65,27 @@ pub trait Stages: Sync {
     fn notice(&self, text: &str);
 }
 
+/// Where a job records what, and where it drives.
+#[derive(Clone, Debug)]
+pub struct Scope {
+    /// Folder of the training sets.
+    pub recordings: PathBuf,
+    /// What is recorded and trained on.
+    pub takes: Vec<Take>,
+    /// What is driven.
+    pub tracks: Vec<String>,
+}
+
+impl Default for Scope {
+    /// The whole set under [`RECORDINGS`], all of [`TRACKS`].
+    fn default() -> Scope {
+        Scope { recordings: RECORDINGS.into(), takes: training_set::takes(), tracks: TRACKS.map(String::from).to_vec() }
+    }
+}
+
 /// A main job under way. Run it inside a rayon pool.
 pub struct Job<'a> {
+    scope: Scope,
     note: JobNote,
     observer: &'a mut (dyn Observer + Send),
     stages: &'a dyn Stages,
@@ -86,12 +109,13 @@ pub struct JobRequest {
 impl<'a> Job<'a> {
     /// A job that ends with what `note` says.
     pub fn new(
+        scope: Scope,
         note: JobNote,
         observer: &'a mut (dyn Observer + Send),
         stages: &'a dyn Stages,
         stop: &'a AtomicBool,
     ) -> Job<'a> {
-        Job { note, observer, stages, stop, folder: None }
+        Job { scope, note, observer, stages, stop, folder: None }
     }
 
     /// The run folder that `train --resume` takes after a stop; `None` as long as nothing was trained.
@@ -106,16 +130,11 @@ impl<'a> Job<'a> {
     /// As [`training_set::recordings`], [`training::train`] and [`test_on_track`]; [`Error::Interrupted`] after a stop.
     pub fn begin(&mut self, request: JobRequest) -> Result<MainJobResult> {
         let JobRequest { recipe, out, seed, cache_mib } = request;
+        RunFolder::require_free(&out)?;
         for round in 1..=self.note.dagger_rounds {
-            let later = dagger_folder(&out, 0, round)?;
-            if later.exists() {
-                return Err(Error::Usage(format!(
-                    "{}: exists already and is not overwritten; name another folder with --out",
-                    later.display()
-                )));
-            }
+            RunFolder::require_free(&dagger_folder(&out, 0, round)?)?;
         }
-        let recordings = training_set(&training_set::takes(), self.stages, self.stop)?;
+        let recordings = training_set(&self.scope.recordings, &self.scope.takes, self.stages, self.stop)?;
         let training = self.train(TrainRequest { recordings, recipe, out, seed, cache_mib, from: None })?;
         self.rest(training)
     }
@@ -135,17 +154,21 @@ impl<'a> Job<'a> {
         while self.note.round < self.note.dagger_rounds {
             training = self.dagger_round(&training)?;
         }
-        let drives = self.drives(&training.model)?;
-        Ok(MainJobResult { training, drives })
+        let result = MainJobResult { drives: self.drives(&training.model)?, training };
+        if let Some(folder) = &self.folder {
+            write_json(&folder.join("drives.json"), &result.drives)?;
+        }
+        Ok(result)
     }
 
     fn train(&mut self, request: TrainRequest) -> Result<TrainResult> {
-        RunFolder::create(&request.out)?;
         self.note.write(&request.out)?;
         let out = request.out.clone();
         let result = training::train(request, self.observer, self.stop);
-        // Before `run.json` is there, nothing can be resumed.
-        self.folder = RunFolder::open(&out).is_ok().then_some(out);
+        // Before `run.json` is there this run cannot be resumed, but the one before it can.
+        if RunFolder::open(&out).is_ok() {
+            self.folder = Some(out);
+        }
         result
     }
 
@@ -163,7 +186,7 @@ impl<'a> Job<'a> {
                 told(share);
                 !self.stop.load(Ordering::Relaxed)
             };
-            dagger::recordings(&pilot, &path.join("dagger"), round, &progress)?
+            dagger::recordings(&pilot, &self.scope.takes, &path.join("dagger"), round, &progress)?
         };
         let mut recordings = info.recordings;
         recordings.extend(recorded);
@@ -171,11 +194,11 @@ impl<'a> Job<'a> {
         self.train(TrainRequest { recordings, recipe, out, seed: info.seed, cache_mib: info.cache_mib, from: None })
     }
 
-    /// Drives `model` on every track of the main job, tracks in parallel.
+    /// Drives `model` on every track of the job.
     fn drives(&self, model: &Path) -> Result<Vec<TrackResult>> {
         let pilot = Pilot::load(model)?;
         let options = DriveOptions { runs: self.note.runs, ..Default::default() };
-        test_on_tracks(&pilot, &TRACKS, &options, self.stages, self.stop)
+        test_on_tracks(&pilot, &self.scope.tracks, &options, self.stages, self.stop)
     }
 }
 
@@ -206,22 +229,22 @@ pub fn test_on_tracks<T: AsRef<str> + Sync>(
     tracks.par_iter().enumerate().map(on_track).collect()
 }
 
-/// The recordings of `takes` under [`RECORDINGS`], recorded now if they are not there.
+/// The recordings of `takes` under `folder`, recorded now if they are not there.
 ///
 /// # Errors
 ///
 /// As [`training_set::recordings`].
-pub fn training_set(takes: &[training_set::Take], stages: &dyn Stages, stop: &AtomicBool) -> Result<Vec<PathBuf>> {
+pub fn training_set(folder: &Path, takes: &[Take], stages: &dyn Stages, stop: &AtomicBool) -> Result<Vec<PathBuf>> {
     let (paths, reused) = {
         let told = stages.begin("recording the expert");
         let progress = |share| {
             told(share);
             !stop.load(Ordering::Relaxed)
         };
-        training_set::recordings(Path::new(RECORDINGS), takes, &progress)?
+        training_set::recordings(folder, takes, &progress)?
     };
     let verb = if reused { "found" } else { "recorded" };
-    stages.notice(&format!("{verb} the training set of {} recordings under {RECORDINGS}", paths.len()));
+    stages.notice(&format!("{verb} the training set of {} recordings under {}", paths.len(), folder.display()));
     Ok(paths)
 }
 

@@ -8,10 +8,12 @@ use serde::Serialize;
 use sha2::{Digest, Sha256};
 
 use crate::error::{Error, Result};
-use crate::simulator::{RecordOptions, Track, builtin, record};
+use crate::simulator::{RecordOptions, Track, record};
 
 /// Random tracks in the set. Variety of looks teaches more than laps: each is driven for a fraction of a lap.
 const RANDOM_TRACKS: u64 = 48;
+/// Raised whenever the simulator draws or drives otherwise than before: sets recorded earlier are then not used again.
+const PICTURES: u32 = 2;
 /// Rows for each second: at 20 mph every 1.8 m. Twice the road teaches more than twice the frames.
 const HZ: u64 = 5;
 /// Seed of the first recording; far from those that drives begin with, so that starts and light are others.
@@ -80,14 +82,19 @@ fn settings(takes: &[Take]) -> Result<String> {
     #[derive(Serialize)]
     struct Settings<'a> {
         version: &'a str,
+        pictures: u32,
         hz: u64,
         tracks_hash: String,
         take: &'a [Take],
     }
+    let failed = |e: toml::ser::Error| Error::Usage(format!("the training set cannot be described: {e}"));
     let mut tracks = Sha256::new();
-    builtin::names().filter_map(builtin::text).for_each(|text| tracks.update(text));
-    let settings = Settings { version: env!("CARGO_PKG_VERSION"), hz: HZ, tracks_hash: digits(tracks), take: takes };
-    toml::to_string(&settings).map_err(|e| Error::Usage(format!("the training set cannot be described: {e}")))
+    for of_track in takes.chunk_by(|a, b| a.track == b.track) {
+        tracks.update(toml::to_string(&Track::load(&of_track[0].track)?.spec).map_err(failed)?);
+    }
+    let (version, tracks_hash) = (env!("CARGO_PKG_VERSION"), digits(tracks));
+    let settings = Settings { version, pictures: PICTURES, hz: HZ, tracks_hash, take: takes };
+    toml::to_string(&settings).map_err(failed)
 }
 
 /// The first 16 digits of a hash.

@@ -28,7 +28,7 @@ pub(super) enum Kind {
     /// A single layer, as it is.
     Layer,
     NormRectify(NormRectify),
-    PooledConv(PooledConv),
+    PooledConv(Box<PooledConv>),
 }
 
 impl Stage {
@@ -111,7 +111,7 @@ pub(super) fn stages(network: &Network) -> Vec<Stage> {
             source.is_some_and(|at| matches!(stages[at].kind, Kind::Layer) && stages[at].forgets_output(network));
         let fused = match norm_rectify(network, &layers[next..]) {
             Some((count, fused)) if after_linear => Some((count, Kind::NormRectify(fused))),
-            _ => pooled_conv(network, &layers[next..]).map(|fused| (3, Kind::PooledConv(fused))),
+            _ => pooled_conv(network, &layers[next..]).map(|fused| (3, Kind::PooledConv(Box::new(fused)))),
         };
         let (count, kind) = fused.unwrap_or((1, Kind::Layer));
         stages.push(Stage { layers: next..next + count, kind, source });

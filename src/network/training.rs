@@ -496,7 +496,7 @@ impl<'a> Run<'a> {
         let dparams = &mut shard.gradient[stage.params(self.network)];
         match &stage.kind {
             Kind::Layer | Kind::PooledConv(_) => barrier.backward_sums(moments, n, x, dy, sums, dparams),
-            Kind::NormRectify(fused) => fused.backward_sums(self.params(index), moments, n, x, dy, sums, dparams),
+            Kind::NormRectify(fused) => fused.backward_sums(self.params(index), moments, x, dy, sums, dparams),
         }
     }
 }

@@ -100,9 +100,9 @@ impl Saliency {
                 }
                 LayerSpec::BatchNorm { .. }
                 | LayerSpec::Relu {}
+                | LayerSpec::LeakyRelu { .. }
                 | LayerSpec::Elu { .. }
                 | LayerSpec::PRelu { .. }
-                | LayerSpec::LeakyRelu { .. }
                 | LayerSpec::Tanh {}
                 | LayerSpec::Softsign {}
                 | LayerSpec::Dropout { .. }

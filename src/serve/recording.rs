@@ -210,6 +210,7 @@ mod tests {
         assert_eq!((recorded.rows, recorded.dropped), (20, 0));
         let recording = dataset::load(&folder).unwrap();
         assert_eq!((recording.rows.len(), recording.sessions.len()), (20, 1));
+        assert!(recording.notices.is_empty(), "{:?}", recording.notices);
         let row = &recording.rows[4];
         assert_eq!((row.steering, row.throttle, row.brake, row.speed_mph), (-0.3, 0.0, 0.6, 12.5));
         assert!(Recorder::start(&folder).is_err(), "an existing folder is refused");

@@ -85,6 +85,7 @@ fn wall_height(wall: Wall) -> (f32, f32) {
     match wall {
         Wall::Parapet => (0.0, 1.05),
         Wall::Rail => (0.0, 0.78),
+        Wall::Barrier => (0.0, 0.85),
         Wall::Stone => (0.0, 0.7),
         Wall::Fence => (0.0, 1.15),
     }
@@ -102,6 +103,11 @@ fn wall_colour(wall: Wall, along_m: f32, up_m: f32) -> Option<[f32; 3]> {
             } else {
                 post.then_some([120.0, 118.0, 114.0])
             }
+        }
+        Wall::Barrier => {
+            let gap = along_m.rem_euclid(4.0) < 0.08;
+            let grey = if gap { 92.0 } else { 168.0 + 26.0 * up_m };
+            Some([grey, grey, 0.97 * grey])
         }
         Wall::Stone => {
             let course = (up_m / 0.24) as i32;

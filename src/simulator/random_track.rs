@@ -103,7 +103,10 @@ fn soil(rng: &mut Rng) -> Rgb {
 const SHOULDER_M: f64 = 3.5;
 
 fn look(rng: &mut Rng, name: &str) -> Look {
-    let surface = pick(rng, &[Surface::Asphalt, Surface::Asphalt, Surface::Patched, Surface::Patched, Surface::Cobble]);
+    let surface = pick(
+        rng,
+        &[Surface::Asphalt, Surface::Asphalt, Surface::Patched, Surface::Seamed, Surface::Seamed, Surface::Cobble],
+    );
     let centre = pick(rng, &[Centre::None, Centre::None, Centre::Dashed, Centre::Dashed, Centre::Solid]);
     let edges = [Edge::White, Edge::Yellow, Edge::YellowKerbstone, Edge::Kerb, Edge::Bare, Edge::Bare, Edge::Bare];
     let left = pick(rng, &edges);
@@ -186,7 +189,7 @@ fn stretches(rng: &mut Rng, lap_m: f64, spec: &TrackSpec) -> Vec<Stretch> {
         let (left, right) = (side(), side());
         let mut wall = |side: Side| {
             let open = matches!(side, Side::Drop | Side::Water);
-            (rng.unit() < if open { 0.5 } else { 0.08 }).then(|| pick(rng, &[Wall::Rail, Wall::Parapet]))
+            (rng.unit() < if open { 0.5 } else { 0.08 }).then(|| pick(rng, &[Wall::Rail, Wall::Parapet, Wall::Barrier]))
         };
         let (left_wall, right_wall) = (wall(left), wall(right));
         let look = pick(rng, &LOOKS);

@@ -181,28 +181,13 @@ fn grain(along: f32, across: f32, size_m: f32, stretch: f32, seed: u32) -> f32 {
     value_noise(along * cells / PERIOD_M, (across + HALF_M) / size_m, Some((cells as i32, wide as i32 + 1)), seed) - 0.5
 }
 
+/// A ragged border never departs farther from the edge, m.
+const MOST_RAGGED_M: f32 = 0.8;
+
 fn paint_texel(look: &Look, along: f32, across: f32, sun: [f32; 3], seed: u32) -> u32 {
     let edge = if across < 0.0 { look.left } else { look.right };
     let out = across.abs() - HALF_ROAD_M;
-    let mut rgb = surface(look, along, across, seed);
-    let wear = (0.85 + 0.4 * grain(along, across, 0.25, 1.0, seed + 5)).min(0.95);
-    let painted = match look.centre {
-        Centre::None => None,
-        Centre::Dashed => (across.abs() < 0.1 && along.rem_euclid(12.0) < 4.5).then_some(WHITE),
-        Centre::Solid => (across.abs() < 0.075).then_some(WHITE),
-        Centre::Yellow => (across.abs() < 0.07).then_some(YELLOW),
-    };
-    if let Some(paint) = painted {
-        rgb = mix(rgb, paint, wear);
-    }
-    let line = |at: f32, half: f32| (out + at).abs() < half;
-    match edge {
-        Edge::White if line(0.24, 0.1) => rgb = mix(rgb, WHITE, wear),
-        Edge::Yellow | Edge::YellowKerbstone if line(0.42, 0.07) => rgb = mix(rgb, YELLOW, wear),
-        Edge::Dashes if line(0.3, 0.08) && along.rem_euclid(3.0) < 1.0 => rgb = mix(rgb, WHITE, wear),
-        _ => {}
-    }
-    // Beyond the edge: kerbs first, then the shoulder, then the land shows through.
+    // Noise is the dearest here, so each is taken only where it shows.
     let (kerb_m, kerb) = match edge {
         Edge::Kerb => {
             let red = along.rem_euclid(1.5) < 0.75;
@@ -212,22 +197,48 @@ fn paint_texel(look: &Look, along: f32, across: f32, sun: [f32; 3], seed: u32) -
         _ => (0.0, [0.0; 3]),
     };
     let ragged = match edge {
+        _ if (out - kerb_m).abs() > MOST_RAGGED_M => 0.0,
         Edge::Overgrown => {
             1.1 * grain(along, across, 0.7, 1.0, seed + 7) + 0.5 * grain(along, across, 0.12, 1.0, seed + 8)
         }
         Edge::Bare | Edge::White => 0.3 * grain(along, across, 0.4, 1.0, seed + 7),
         _ => 0.0,
     };
-    if out > 0.0 && out < kerb_m {
-        rgb = mix(kerb, [90.0; 3], 0.25 * (0.5 + grain(along, across, 0.3, 1.0, seed + 3)));
+    // Beyond the edge: kerbs first, then the shoulder, then the land shows through.
+    let rgb = if out > 0.0 && out < kerb_m {
+        mix(kerb, [90.0; 3], 0.25 * (0.5 + grain(along, across, 0.3, 1.0, seed + 3)))
     } else if out + ragged > kerb_m {
         let n = 1.0 + 0.5 * grain(along, across, 0.15, 1.0, seed + 1) + 0.35 * grain(along, across, 1.1, 1.0, seed + 2);
-        rgb = scaled(look.shoulder, n);
-    }
+        scaled(look.shoulder, n)
+    } else {
+        painted_surface(look, edge, along, across, seed)
+    };
     let end = kerb_m + look.shoulder_m.min(HALF_M - HALF_ROAD_M - kerb_m - 0.05);
-    let fringe = out + 0.5 * grain(along, across, 0.5, 1.0, seed + 9);
+    let fringe = match out - end {
+        inside if inside < -0.5 => out,
+        _ => out + 0.5 * grain(along, across, 0.5, 1.0, seed + 9),
+    };
     let coloured = std::array::from_fn(|k| rgb[k] * lerp(1.0, sun[k], 0.8));
     pack(coloured, 1.0 - smoothstep(end - 0.25, end, fringe))
+}
+
+/// The surface with the paint on it.
+fn painted_surface(look: &Look, edge: Edge, along: f32, across: f32, seed: u32) -> [f32; 3] {
+    let line = |at: f32, half: f32| (across.abs() - HALF_ROAD_M + at).abs() < half;
+    let centre = match look.centre {
+        Centre::None => None,
+        Centre::Dashed => (across.abs() < 0.1 && along.rem_euclid(12.0) < 4.5).then_some(WHITE),
+        Centre::Solid => (across.abs() < 0.075).then_some(WHITE),
+        Centre::Yellow => (across.abs() < 0.07).then_some(YELLOW),
+    };
+    let paint = match edge {
+        Edge::White if line(0.24, 0.1) => Some(WHITE),
+        Edge::Yellow | Edge::YellowKerbstone if line(0.42, 0.07) => Some(YELLOW),
+        Edge::Dashes if line(0.3, 0.08) && along.rem_euclid(3.0) < 1.0 => Some(WHITE),
+        _ => centre,
+    };
+    let bare = surface(look, along, across, seed);
+    paint.map_or(bare, |paint| mix(bare, paint, (0.85 + 0.4 * grain(along, across, 0.25, 1.0, seed + 5)).min(0.95)))
 }
 
 fn surface(look: &Look, along: f32, across: f32, seed: u32) -> [f32; 3] {
@@ -253,6 +264,17 @@ fn surface(look: &Look, along: f32, across: f32, seed: u32) -> [f32; 3] {
             let stone = 0.75 + 0.5 * hash2(column, row as i32, seed + 31);
             let joint = fu.min(1.0 - fu).min((fv.min(1.0 - fv)) * 0.64) < 0.05;
             scaled(look.tone, if joint { 0.5 } else { stone + look.grain * 0.5 * fine })
+        }
+        Surface::Seamed => {
+            // Seams wander a little; where they lie and how dark they are differs from look to look.
+            let drawn = |k: i32| hash2(k, 0, seed + 60);
+            let wander = 0.25 * grain(along, across, 1.5, 4.0, seed + 61);
+            let lane_m = 1.6 + 2.4 * drawn(0);
+            let beside = (across + wander + lane_m * drawn(1)).rem_euclid(lane_m);
+            let bays = 1.0 + (6.0 * drawn(2)).floor();
+            let before = (along + wander + PERIOD_M * drawn(3)).rem_euclid(PERIOD_M / bays);
+            let seam = beside < 0.03 + 0.08 * drawn(4) || before < 0.12 + 0.2 * drawn(5);
+            scaled(look.tone, if seam { plain * (0.4 + 0.4 * drawn(6)) } else { plain })
         }
         Surface::Concrete => {
             let slab = (along / 6.0).floor() as i32;

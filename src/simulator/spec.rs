@@ -161,6 +161,8 @@ pub enum Surface {
     Patched,
     /// Rows of paving stones.
     Cobble,
+    /// Asphalt laid in lanes, with sealed seams along and across.
+    Seamed,
     /// Slabs of concrete with joints; only on held-out tracks.
     Concrete,
     /// Loose gravel with wheel tracks; only on held-out tracks.
@@ -247,6 +249,8 @@ pub enum Wall {
     Parapet,
     /// A steel guard rail on posts.
     Rail,
+    /// A pale concrete barrier in pieces of 4 m.
+    Barrier,
     /// A low wall of light stones; only on held-out tracks.
     Stone,
     /// A wooden fence; only on held-out tracks.

@@ -43,12 +43,12 @@ impl RunFolder {
     /// Name of the file in which the main job notes what follows on the training. It may be there before a run begins.
     pub const JOB_NOTE: &str = "main-job.json";
 
-    /// A new run in `path`, which must not exist or be empty.
+    /// Checks that a new run can begin in `path`: it must not exist or be empty.
     ///
     /// # Errors
     ///
-    /// [`Error::Usage`] if there is something in it already, [`Error::Io`] if it cannot be made.
-    pub fn create(path: &Path) -> Result<RunFolder> {
+    /// [`Error::Usage`] if there is something in it already, [`Error::Io`] if it cannot be read.
+    pub fn require_free(path: &Path) -> Result<()> {
         let taken = |entry: std::io::Result<std::fs::DirEntry>| entry.is_ok_and(|e| e.file_name() != Self::JOB_NOTE);
         if path.exists() && std::fs::read_dir(path).map_err(Error::io(path))?.any(taken) {
             return Err(Error::Usage(format!(
@@ -57,6 +57,16 @@ impl RunFolder {
                 path.display()
             )));
         }
+        Ok(())
+    }
+
+    /// A new run in `path`, which must not exist or be empty.
+    ///
+    /// # Errors
+    ///
+    /// As [`RunFolder::require_free`]; [`Error::Io`] if it cannot be made.
+    pub fn create(path: &Path) -> Result<RunFolder> {
+        RunFolder::require_free(path)?;
         std::fs::create_dir_all(path).map_err(Error::io(path))?;
         Ok(RunFolder { path: path.to_path_buf() })
     }

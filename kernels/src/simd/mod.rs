@@ -100,7 +100,7 @@ pub(crate) trait Simd: Copy {
         let mut lanes = [[0.0; 16]; 2];
         for i in 0..2 * Self::LANES {
             // SAFETY: the caller vouches for `2 LANES` values.
-            lanes[i % 2][i / 2 & 15] = unsafe { *p.add(i) };
+            lanes[i % 2][(i / 2) & 15] = unsafe { *p.add(i) };
         }
         // SAFETY: each row of `lanes` holds 16 values, and no vector is longer.
         unsafe { [self.load(lanes[0].as_ptr()), self.load(lanes[1].as_ptr())] }
@@ -117,7 +117,7 @@ pub(crate) trait Simd: Copy {
             self.store(lanes[0].as_mut_ptr(), v[0]);
             self.store(lanes[1].as_mut_ptr(), v[1]);
             for i in 0..2 * Self::LANES {
-                *p.add(i) = lanes[i % 2][i / 2 & 15];
+                *p.add(i) = lanes[i % 2][(i / 2) & 15];
             }
         }
     }
