@@ -171,6 +171,7 @@ impl Nodes<'_> {
         let [r, g, b] = names;
         let planes = match colour {
             Colour::Rgb => unreachable!("returned above"),
+            Colour::Bgr => [b, g, r].map(String::from),
             Colour::Yuv => self.yuv([r, g, b]),
             Colour::YuvOld => self.yuv([b, g, r]),
             Colour::Gray => return self.luminance([r, g, b], [9798.0, 19235.0, 3735.0], 15),

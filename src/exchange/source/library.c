@@ -109,6 +109,13 @@ static void rgb(const uint8_t *pixel, uint8_t *out) {
     out[2] = pixel[2];
 }
 
+/* == bgr */
+static void bgr(const uint8_t *pixel, uint8_t *out) {
+    out[0] = pixel[2];
+    out[1] = pixel[1];
+    out[2] = pixel[0];
+}
+
 /* == gray */
 /* Luminance with BT.601 weights. */
 static void gray(const uint8_t *pixel, uint8_t *out) {

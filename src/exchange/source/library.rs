@@ -109,6 +109,11 @@ fn rgb(pixel: [u8; 3]) -> [u8; 3] {
     pixel
 }
 
+// == bgr
+fn bgr([r, g, b]: [u8; 3]) -> [u8; 3] {
+    [b, g, r]
+}
+
 // == gray
 /// Luminance with BT.601 weights, in the first place.
 fn gray(pixel: [u8; 3]) -> [u8; 3] {

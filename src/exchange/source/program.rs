@@ -231,6 +231,7 @@ impl<'a> Program<'a> {
         let mut table = |name: &str, values| self.tables.push(Array { name: name.into(), values });
         let convert = match colour {
             Colour::Rgb => "rgb",
+            Colour::Bgr => "bgr",
             Colour::Yuv => "yuv",
             Colour::YuvOld => "yuv_old",
             Colour::Hsv => {
