@@ -47,7 +47,8 @@ const LAYERS: &str = r#"[
 ]"#;
 
 /// Every colour space, resized in every way: halved, linear down and up, area down and up, not at all.
-const PREPROCESSINGS: [(&str, &str); 9] = [
+const PREPROCESSINGS: [(&str, &str); 10] = [
+    ("bgr", "colour = 'bgr', rows = [1, 39], resize = [21, 33]"),
     ("yuv-old", "colour = 'yuv-old', interpolation = 'linear', rows = [5, 38], resize = [19, 23]"),
     ("hsv", "colour = 'hsv', rows = [2, 38], resize = [18, 25]"),
     ("hls", "colour = 'hls', interpolation = 'area', rows = [0, 37], resize = [17, 31], colour_first = true"),

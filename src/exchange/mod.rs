@@ -1,8 +1,7 @@
-//! Models of other programs, and ours for them: Keras files come in; ONNX files, and source code that needs nothing else, go
-//! out.
+//! Models from and for other programs: [`keras`] reads old models, with [`presets`] and [`fit`] for the preprocessing that their
+//! files do not hold; [`onnx`] and [`source`] write ours as ONNX files and as source code that needs nothing else.
 //!
-//! Every export begins with the network as a [`chain`] of operations without training; [`onnx`] and [`source`] write it down,
-//! together with the preprocessing. [`keras`] reads; [`presets`] and [`fit`] find the preprocessing that such files lack.
+//! Every export begins with the network as a chain of operations without training.
 
 pub(crate) mod chain;
 pub mod fit;

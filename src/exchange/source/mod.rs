@@ -1,7 +1,7 @@
 //! Source code with the weights in it, in C99 or Rust: one file that needs nothing else.
 //!
 //! The file holds the preprocessing, the network and the buffers, so that memory is bounded and nothing is allocated. A model
-//! becomes a [`Program`](program::Program), the same for both languages: arrays and calls of the functions in `library.c` or
+//! becomes a program, the same for both languages: arrays and calls of the functions in `library.c` or
 //! `library.rs`, of which the file gets those that it calls. Batch normalisation is folded into the layer before it.
 
 mod c;
