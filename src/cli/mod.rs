@@ -9,6 +9,7 @@ mod drive;
 mod evaluate;
 mod experiment;
 mod explain;
+mod import;
 mod inspect;
 mod predict;
 mod progress;
@@ -17,6 +18,7 @@ mod serve;
 mod share_bar;
 mod sim;
 mod summary;
+mod tracks;
 mod train;
 
 use std::io::{ErrorKind, Write};
@@ -51,10 +53,12 @@ enum Command {
     Experiment(experiment::ExperimentArgs),
     Predict(predict::PredictArgs),
     Inspect(inspect::InspectArgs),
+    Tracks(tracks::TracksArgs),
     Explain(explain::ExplainArgs),
     Compare(compare::CompareArgs),
     Summary(summary::SummaryArgs),
     Bench(bench::BenchArgs),
+    Import(import::ImportArgs),
 }
 
 /// Runs the command line of this process.
@@ -70,10 +74,12 @@ pub fn main() -> ExitCode {
         Command::Experiment(args) => experiment::run(args),
         Command::Predict(args) => predict::run(args),
         Command::Inspect(args) => inspect::run(args),
+        Command::Tracks(args) => tracks::run(args),
         Command::Explain(args) => explain::run(args),
         Command::Compare(args) => compare::run(args),
         Command::Summary(args) => summary::run(args),
         Command::Bench(args) => bench::run(args, started),
+        Command::Import(args) => import::run(args),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,

@@ -11,11 +11,11 @@ use super::share_bar::ShareBar;
 use super::{or_dash, print_json, stop_on_ctrl_c};
 use crate::atomic_file;
 use crate::error::{Error, Result};
+use crate::new_folder::create_now;
 use crate::serve::client::{ClientOptions, ClientReport, Numbers, Observer, Pace, ServerUrl, drive};
 use crate::serve::protocol::DecimalMark;
 use crate::simulator::Track;
 use crate::simulator::drive::trajectory_csv;
-use crate::simulator::recorder::create_new_folder;
 use crate::simulator::run::{Failure, line_errors_m};
 use crate::simulator::statistics::quantile;
 
@@ -58,7 +58,7 @@ pub struct SimArgs {
     /// Second at which the scene is left without a word to the server, and entered again
     #[arg(long, value_name = "SECOND")]
     scene_change: Option<f64>,
-    /// Stop after so many replies
+    /// Stop after so many telemetries were answered
     #[arg(long, value_name = "N")]
     frames: Option<u64>,
     /// Longest time without a reply, in seconds
@@ -96,6 +96,7 @@ struct Summary {
     manual_telemetries: u64,
     commands: u64,
     manuals: u64,
+    questions: u64,
     tokens_lost: u64,
     connections: u64,
     /// Commands for each second of the clock.
@@ -131,6 +132,7 @@ impl Summary {
             manual_telemetries: report.manual_telemetries,
             commands: report.commands,
             manuals: report.manuals,
+            questions: report.questions,
             tokens_lost: report.tokens_lost,
             connections: report.connections,
             commands_per_s: report.commands as f64 / report.wall_s.max(1e-9),
@@ -160,8 +162,8 @@ impl Summary {
             self.telemetries, self.manual_telemetries
         );
         println!(
-            "replies                    {} commands ({:.1}/s), {} `manual`, {} unreadable",
-            self.commands, self.commands_per_s, self.manuals, self.tokens_lost
+            "replies                    {} commands ({:.1}/s), {} `manual`, {} unreadable; {} questions",
+            self.commands, self.commands_per_s, self.manuals, self.tokens_lost, self.questions
         );
         let [p50, p99, max] =
             [self.round_trip_ms_p50, self.round_trip_ms_p99, self.round_trip_ms_max].map(|ms| or_dash(ms, 2));
@@ -196,7 +198,7 @@ pub fn run(args: SimArgs) -> Result<()> {
     let report = drive(&track, &options, &mut progress)?;
     drop(progress);
     if let Some(out) = &args.out {
-        create_new_folder(out)?;
+        create_now(out)?;
         atomic_file::write(&out.join(format!("free_{}.csv", args.seed)), trajectory_csv(&report.run).as_bytes())?;
     }
     let summary = Summary::new(&args, &track, &report);

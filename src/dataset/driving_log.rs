@@ -186,7 +186,8 @@ fn usual(fields: &[&str], line: u32) -> Result<Entry, Fault> {
         // A path may hold commas: it goes on to the field that ends as an image file does.
         let length = fields.iter().position(|field| is_image(field)).map_or(1, |last| last + 1);
         let (path, rest) = fields.split_at(length.min(fields.len()));
-        *image = Some(path.join(",").trim().to_owned());
+        // Logs of cars with one camera leave the sides empty.
+        *image = Some(path.join(",").trim().to_owned()).filter(|path| !path.is_empty());
         fields = rest;
     }
     // A comma at the end of the line makes an empty field.

@@ -22,4 +22,4 @@ pub mod split_view;
 pub mod steering;
 pub mod svg;
 
-pub use metrics::{Metrics, Prediction};
+pub use metrics::{Metrics, Prediction, correlation};

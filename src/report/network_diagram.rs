@@ -33,11 +33,14 @@ fn stages(network: &Network) -> Vec<Stage> {
             LayerSpec::Conv2d { .. } => Some(BLUE),
             LayerSpec::MaxPool { .. } | LayerSpec::AveragePool { .. } => Some(GREEN),
             LayerSpec::Dense { .. } => Some(ORANGE),
-            LayerSpec::Flatten {} | LayerSpec::Crop { .. } => Some(PALE),
+            LayerSpec::Flatten {} | LayerSpec::Crop { .. } | LayerSpec::ZeroPad { .. } => Some(PALE),
             LayerSpec::BatchNorm { .. }
             | LayerSpec::Relu {}
             | LayerSpec::Elu { .. }
             | LayerSpec::PRelu { .. }
+            | LayerSpec::LeakyRelu { .. }
+            | LayerSpec::Tanh {}
+            | LayerSpec::Softsign {}
             | LayerSpec::Dropout { .. }
             | LayerSpec::Scale { .. } => None,
         };

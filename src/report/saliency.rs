@@ -94,10 +94,17 @@ impl Saliency {
                     steps.push(axes([1, 1], [1, 1], [-(rows[0] as isize), -(columns[0] as isize)]));
                     after_convolution = false;
                 }
+                LayerSpec::ZeroPad { rows, columns } => {
+                    steps.push(axes([1, 1], [1, 1], [rows[0] as isize, columns[0] as isize]));
+                    after_convolution = false;
+                }
                 LayerSpec::BatchNorm { .. }
                 | LayerSpec::Relu {}
+                | LayerSpec::LeakyRelu { .. }
                 | LayerSpec::Elu { .. }
                 | LayerSpec::PRelu { .. }
+                | LayerSpec::Tanh {}
+                | LayerSpec::Softsign {}
                 | LayerSpec::Dropout { .. }
                 | LayerSpec::Scale { .. } => {
                     // The map counts as it leaves the activation.

@@ -1,6 +1,6 @@
 //! One client: its handshake, its messages, its deadlines.
 
-use std::io::{ErrorKind, Read, Write};
+use std::io::{Read, Write};
 use std::net::SocketAddr;
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, PoisonError};
@@ -13,6 +13,7 @@ use tungstenite::{Message, Utf8Bytes, WebSocket};
 use super::handshake::{Client, MAX_HEAD, Verdict, examine};
 use super::helm::{Clock, Helm};
 use super::journal::Event;
+use super::pace::Pace;
 use super::protocol::{
     self, ClientPacket, Command, DecimalMark, EngineVersion, NumberStyle, PING_INTERVAL_MS, PING_TIMEOUT_MS,
     ProtocolError, Telemetry,
@@ -21,7 +22,7 @@ use super::recording::Queued;
 use super::registry::{Peer, Stage};
 use super::seat::Claim;
 use super::server::Shared;
-use super::socket::Socket;
+use super::socket::{Socket, is_timeout};
 use super::tokens::Tokens;
 
 /// Largest message, bytes.
@@ -32,6 +33,8 @@ const MAX_IMAGE_SIDE: usize = 1920;
 const MAX_BATCH: usize = 16;
 /// Time for the whole request of a handshake.
 const HANDSHAKE_TIME: Duration = Duration::from_secs(5);
+/// Time that a client has to read the last words.
+const FAREWELL: Duration = Duration::from_millis(200);
 /// Time that an unknown client has for telemetry before it gets the handshake of Socket.IO.
 const GREETING_TIME: Duration = Duration::from_millis(50);
 /// Telemetry is stale after this time: the throttle is cut.
@@ -127,6 +130,7 @@ fn open<'a>(shared: &'a Shared, peer: &'a Arc<Peer>, address: SocketAddr) -> Res
                 show_request(shared, address, &head);
                 journal.step(format_args!("{address} < {}", response.lines().next().unwrap_or("")));
                 socket.write_all(response.as_bytes())?;
+                socket.finish(FAREWELL);
                 return Err(End::Fault(Event::Refused, format!("refused, {reason}")));
             }
             Verdict::Accept { response, head_len, client } => break (response, head_len, client),
@@ -162,18 +166,18 @@ fn open<'a>(shared: &'a Shared, peer: &'a Arc<Peer>, address: SocketAddr) -> Res
         websocket,
         tokens: Tokens::new(u32::from(client.is_simulator())),
         client,
-        greeting: Greeting::None,
+        greeted: false,
         opened: now,
         last_message: now,
         last_ping: now,
         last_telemetry: None,
         last_question: now,
-        telemetry_seen: false,
         held: None,
         faults: 0,
         style: NumberStyle::default(),
         helm: Helm::new(shared.options.helm),
         waits: false,
+        pace: Pace::new(now),
         lockstep: false,
         overridden: false,
         cut: false,
@@ -182,10 +186,6 @@ fn open<'a>(shared: &'a Shared, peer: &'a Arc<Peer>, address: SocketAddr) -> Res
         image: Vec::new(),
         reply: String::new(),
     })
-}
-
-fn is_timeout(error: &std::io::Error) -> bool {
-    matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted)
 }
 
 fn show_request(shared: &Shared, address: SocketAddr, head: &[u8]) {
@@ -197,20 +197,15 @@ fn show_request(shared: &Shared, address: SocketAddr, head: &[u8]) {
     }
 }
 
-/// How far the handshake of Socket.IO has come; the simulator does without.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Greeting {
-    None,
-    Opened,
-}
-
+/// A WebSocket and what is known of the client behind it.
 struct Connection<'a> {
     shared: &'a Shared<'a>,
     peer: &'a Arc<Peer>,
     address: SocketAddr,
     websocket: WebSocket<Socket>,
     client: Client,
-    greeting: Greeting,
+    /// Whether it got the handshake of Socket.IO; the simulator does without.
+    greeted: bool,
     opened: Instant,
     last_message: Instant,
     last_ping: Instant,
@@ -218,7 +213,6 @@ struct Connection<'a> {
     last_telemetry: Option<Instant>,
     /// When telemetry was last asked for, without telemetry to answer.
     last_question: Instant,
-    telemetry_seen: bool,
     tokens: Tokens,
     /// Telemetry that is not answered yet, and when its last byte came.
     held: Option<(Utf8Bytes, Instant)>,
@@ -226,6 +220,8 @@ struct Connection<'a> {
     faults: u32,
     style: NumberStyle,
     helm: Helm,
+    /// How much of a stranger's messages is read.
+    pace: Pace,
     /// Was told that another drives.
     waits: bool,
     /// The client waits for each answer: its clock counts, and the server's has no meaning for it.
@@ -250,43 +246,67 @@ impl Connection<'_> {
                 return Ok(());
             }
             self.websocket.get_mut().begin_beat();
+            let mut messages = 1;
             if let Some(message) = self.read()? {
+                let (mut bytes, mut end) = (message.0.len(), Ok(()));
                 batch.push(message);
                 // Whatever else is complete already: of several telemetries only the newest is answered.
                 self.websocket.get_mut().set_waiting(false)?;
-                while batch.len() < MAX_BATCH {
+                while batch.len() < MAX_BATCH && bytes < MAX_MESSAGE {
                     match self.read() {
-                        Ok(Some(message)) => batch.push(message),
+                        Ok(Some(message)) => {
+                            bytes += message.0.len();
+                            batch.push(message);
+                        }
                         Ok(None) => break,
-                        // What came before it is still served; the next read meets the same end.
-                        Err(_) => break,
+                        // What came before it is still served.
+                        Err(error) => {
+                            end = Err(error);
+                            break;
+                        }
                     }
                 }
                 self.websocket.get_mut().set_waiting(true)?;
+                messages = batch.len();
                 self.take(&mut batch)?;
+                end?;
             }
             self.after_beat()?;
+            let bytes = self.websocket.get_mut().take_count();
+            if bytes > 0 && self.peer.stage() != Stage::Trusted {
+                self.rest(messages, bytes);
+            }
+        }
+    }
+
+    /// Lets a stranger wait who has sent so much.
+    fn rest(&mut self, messages: usize, bytes: usize) {
+        /// Time in which it is noticed that the connection has to end.
+        const STEP: Duration = Duration::from_millis(5);
+        let now = Instant::now();
+        let until = now + self.pace.charge(messages, bytes, now);
+        while !self.shared.stop.load(Ordering::Relaxed) && !self.peer.is_closing() {
+            let left = until.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                return;
+            }
+            std::thread::sleep(left.min(STEP));
         }
     }
 
     /// The next complete text message; `None` if none has come within the beat.
     fn read(&mut self) -> Result<Option<(Utf8Bytes, Instant)>, End> {
-        loop {
-            match self.websocket.read() {
-                Ok(Message::Text(text)) => {
-                    self.last_message = Instant::now();
-                    return Ok(Some((text, self.websocket.get_ref().last_byte())));
-                }
-                Ok(Message::Close(_)) => return Err(End::Closed),
-                Ok(Message::Binary(_)) => {
-                    self.fault(Event::NotSocketIo, format_args!("a binary message"))?;
-                    return Ok(None);
-                }
-                // Answered by the next read. Returning lets deadlines be looked after, however many come.
-                Ok(_) => return Ok(None),
-                Err(tungstenite::Error::Io(error)) if is_timeout(&error) => return Ok(None),
-                Err(error) => return Err(error.into()),
+        match self.websocket.read() {
+            Ok(Message::Text(text)) => {
+                self.last_message = Instant::now();
+                Ok(Some((text, self.websocket.get_ref().last_byte())))
             }
+            Ok(Message::Close(_)) => Err(End::Closed),
+            Ok(Message::Binary(_)) => self.fault(Event::NotSocketIo, format_args!("a binary message")).map(|()| None),
+            // Answered by the next read. Returning lets deadlines be looked after, however many come.
+            Ok(_) => Ok(None),
+            Err(tungstenite::Error::Io(error)) if is_timeout(&error) => Ok(None),
+            Err(error) => Err(error.into()),
         }
     }
 
@@ -303,6 +323,7 @@ impl Connection<'_> {
                 self.show('>', text);
                 if is_state(packet) {
                     self.tokens.received(*came);
+                    self.last_telemetry = Some(*came);
                     self.acknowledge(packet)?;
                     if self.held.take().is_some() {
                         self.shared.statistics().superseded += 1;
@@ -351,6 +372,8 @@ impl Connection<'_> {
     fn after_beat(&mut self) -> Result<(), End> {
         if let Some((text, came)) = self.held.take() {
             if self.may_answer() {
+                // Waiting for another client to leave is no delay of the answer.
+                let came = if self.waits { Instant::now() } else { came };
                 if let Ok(packet) = protocol::parse(&text) {
                     self.answer(packet, came)?;
                 }
@@ -359,7 +382,7 @@ impl Connection<'_> {
             }
         }
         let now = Instant::now();
-        if !self.client.is_simulator() && !self.telemetry_seen {
+        if !self.client.is_simulator() && self.last_telemetry.is_none() {
             self.greet(now)?;
         }
         self.keep_alive(now)?;
@@ -379,8 +402,8 @@ impl Connection<'_> {
 
     /// The handshake of Socket.IO for a client that seems to wait for it.
     fn greet(&mut self, now: Instant) -> Result<(), End> {
-        if self.greeting == Greeting::None && now.duration_since(self.opened) >= GREETING_TIME {
-            self.greeting = Greeting::Opened;
+        if !self.greeted && now.duration_since(self.opened) >= GREETING_TIME {
+            self.greeted = true;
             let version = self.client.version;
             let sid = session_id(self.peer.id);
             self.send(|out| protocol::print_open(out, version, &sid))?;
@@ -394,7 +417,7 @@ impl Connection<'_> {
 
     /// Pings of Engine.IO 4 come from the server.
     fn keep_alive(&mut self, now: Instant) -> Result<(), End> {
-        if self.greeting == Greeting::None || self.client.version == EngineVersion::V3 {
+        if !self.greeted || self.client.version == EngineVersion::V3 {
             return Ok(());
         }
         if now.duration_since(self.last_ping) >= Duration::from_millis(PING_INTERVAL_MS) {
@@ -458,7 +481,7 @@ impl Connection<'_> {
                     return self.send(|out| protocol::print_namespace_refused(out, version, namespace));
                 }
                 // The simulator never asks; Socket.IO 2 was connected without being asked.
-                if self.greeting == Greeting::Opened && version == EngineVersion::V4 {
+                if self.greeted && version == EngineVersion::V4 {
                     let sid = session_id(self.peer.id);
                     self.send(|out| protocol::print_connected(out, version, &sid))?;
                 }
@@ -497,8 +520,6 @@ impl Connection<'_> {
 
     /// Answers the newest telemetry, whose last byte came at `came`.
     fn answer(&mut self, packet: ClientPacket, came: Instant) -> Result<(), End> {
-        self.telemetry_seen = true;
-        self.last_telemetry = Some(came);
         let telemetry = match packet {
             ClientPacket::Telemetry(telemetry, _) => telemetry,
             _ => return self.let_person_drive(came),
@@ -522,6 +543,7 @@ impl Connection<'_> {
             Claim::Kept => {}
             Claim::Taken => {
                 self.peer.set_stage(Stage::Trusted);
+                self.waits = false;
                 self.shared.journal.report(Event::Drives, format_args!("{} is driven", self.address));
             }
             // Another was faster; this client's token is kept by asking for its next telemetry.
@@ -640,6 +662,7 @@ impl Connection<'_> {
             let _ = self.steer(command);
         }
         let _ = self.websocket.close(None);
+        self.websocket.get_mut().finish(FAREWELL);
     }
 
     fn steer(&mut self, command: Command) -> Result<(), End> {

@@ -8,8 +8,10 @@ use serde::Serialize;
 
 use super::server::Console;
 
-/// Lines about the same thing come no closer than this.
+/// Each event may be reported once in this time on average.
 const INTERVAL: Duration = Duration::from_secs(5);
+/// Reports of one event that may come in a row before that.
+const BURST: u32 = 5;
 
 /// Something that is reported. Each has its own sentence with the remedy, and is repeated only now and then.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
@@ -122,8 +124,25 @@ pub struct Journal<'a> {
 #[derive(Debug, Default)]
 struct Entry {
     count: u64,
+    /// Not shown since the last that was.
     silent: u64,
-    last: Option<Instant>,
+    /// When the reports shown so far are used up.
+    used_until: Option<Instant>,
+}
+
+impl Entry {
+    /// Whether one more is shown at `now`.
+    fn admit(&mut self, now: Instant) -> bool {
+        self.count += 1;
+        let used_until = self.used_until.map_or(now, |until| until.max(now)) + INTERVAL;
+        let shown = used_until <= now + BURST * INTERVAL;
+        if shown {
+            self.used_until = Some(used_until);
+        } else {
+            self.silent += 1;
+        }
+        shown
+    }
 }
 
 impl<'a> Journal<'a> {
@@ -138,12 +157,9 @@ impl<'a> Journal<'a> {
         let silent = {
             let mut entries = self.entries.lock().unwrap_or_else(PoisonError::into_inner);
             let entry = entries.entry(event).or_default();
-            entry.count += 1;
-            if entry.last.is_some_and(|last| now.duration_since(last) < INTERVAL) {
-                entry.silent += 1;
+            if !entry.admit(now) {
                 return;
             }
-            entry.last = Some(now);
             std::mem::take(&mut entry.silent)
         };
         let more = match silent {
@@ -191,7 +207,7 @@ mod tests {
     }
 
     #[test]
-    fn a_flood_of_one_event_is_one_line_and_hides_no_other() {
+    fn a_flood_of_one_event_is_a_few_lines_and_hides_no_other() {
         let lines = Lines::default();
         let journal = Journal::new(&lines, false);
         for k in 0..1000 {
@@ -200,7 +216,10 @@ mod tests {
         journal.report(Event::NoSpeed, format_args!("telemetry without a speed"));
         journal.step(format_args!("not shown"));
         let lines = lines.0.lock().unwrap();
-        assert_eq!(lines.len(), 2, "{lines:?}");
+        assert_eq!(lines.len(), BURST as usize + 1, "{lines:?}");
+        let (mut entry, now) = (Entry::default(), Instant::now());
+        let shown = (0..6000).filter(|ms| entry.admit(now + Duration::from_millis(*ms * 10))).count();
+        assert_eq!(shown as u32, BURST + 11, "in a minute");
         assert!(lines[0].starts_with("picture 0: the throttle is cut"), "{lines:?}");
         assert_eq!(journal.counts()[&Event::UnreadableImage], 1000);
     }

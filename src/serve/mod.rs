@@ -8,6 +8,26 @@
 //! A client is never trusted: the number of connections, the size and the time of a message are bounded, and only a client
 //! that has shown a complete state of its car can drive it.
 //!
+//! ```no_run
+//! use std::{path::Path, sync::atomic::AtomicBool};
+//! use steersman::pilot::Pilot;
+//! use steersman::serve::{Console, Server, ServerOptions};
+//!
+//! struct Terminal;
+//! impl Console for Terminal {
+//!     fn line(&self, text: &str) {
+//!         eprintln!("{text}");
+//!     }
+//!     fn status(&self, _: &str) {}
+//! }
+//!
+//! let pilot = Pilot::load(Path::new("runs/default-1/model.safetensors"))?;
+//! let stop = AtomicBool::new(false);
+//! let summary = Server::bind(ServerOptions::default())?.run(pilot, &Terminal, &stop)?;
+//! println!("{} frames answered", summary.frames);
+//! # Ok::<(), steersman::Error>(())
+//! ```
+//!
 //! [`Pilot`]: crate::pilot::Pilot
 
 pub mod client;
@@ -16,6 +36,7 @@ pub mod handshake;
 pub mod helm;
 pub mod journal;
 mod latency;
+mod pace;
 pub mod protocol;
 pub mod recording;
 mod registry;

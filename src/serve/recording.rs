@@ -16,7 +16,7 @@ use time::OffsetDateTime;
 use super::helm::Clock;
 use super::protocol::Command;
 use crate::error::{Error, Result};
-use crate::simulator::recorder::create_new_folder;
+use crate::new_folder::create_now;
 
 /// Rows on their way to the disk; a second or two of driving.
 const QUEUE: usize = 64;
@@ -80,7 +80,7 @@ impl Recorder {
     ///
     /// If the folder exists or cannot be written.
     pub fn start(folder: &Path) -> Result<Recorder> {
-        create_new_folder(folder)?;
+        create_now(folder)?;
         let images = folder.join("IMG");
         fs::create_dir(&images).map_err(Error::io(&images))?;
         let log = folder.join("driving_log.csv");
@@ -210,6 +210,7 @@ mod tests {
         assert_eq!((recorded.rows, recorded.dropped), (20, 0));
         let recording = dataset::load(&folder).unwrap();
         assert_eq!((recording.rows.len(), recording.sessions.len()), (20, 1));
+        assert!(recording.notices.is_empty(), "{:?}", recording.notices);
         let row = &recording.rows[4];
         assert_eq!((row.steering, row.throttle, row.brake, row.speed_mph), (-0.3, 0.0, 0.6, 12.5));
         assert!(Recorder::start(&folder).is_err(), "an existing folder is refused");

@@ -23,7 +23,7 @@ use crate::error::{Error, Result};
 use crate::pilot::Pilot;
 
 /// Connections that are kept at once.
-const MAX_CONNECTIONS: usize = 64;
+const MAX_CONNECTIONS: usize = 32;
 /// How long a new connection waits for room.
 const ROOM_PATIENCE: Duration = Duration::from_millis(20);
 /// Pause between looks at the listener.
@@ -158,14 +158,15 @@ impl Shared<'_> {
 pub struct Server {
     listener: TcpListener,
     options: ServerOptions,
+    recorder: Option<Recorder>,
 }
 
 impl Server {
-    /// Begins to listen.
+    /// Begins to listen, and creates the folder of a recording.
     ///
     /// # Errors
     ///
-    /// [`Error::Usage`] with the remedy if the address cannot be had.
+    /// [`Error::Usage`] with the remedy if the address cannot be had or the folder exists.
     pub fn bind(options: ServerOptions) -> Result<Server> {
         let address = options.address;
         let listener = TcpListener::bind(address).map_err(|error| {
@@ -182,7 +183,8 @@ impl Server {
             Error::Usage(format!("cannot listen at {address}: {error}; {remedy}"))
         })?;
         listener.set_nonblocking(true).map_err(|e| Error::Usage(format!("cannot listen at {address}: {e}")))?;
-        Ok(Server { listener, options })
+        let recorder = options.record.as_deref().map(Recorder::start).transpose()?;
+        Ok(Server { listener, options, recorder })
     }
 
     /// The address it listens at.
@@ -198,21 +200,21 @@ impl Server {
     ///
     /// # Errors
     ///
-    /// If the folder for the recording exists, or a recording cannot be written.
+    /// If a recording cannot be written.
     pub fn run(self, pilot: Pilot, console: &dyn Console, stop: &AtomicBool) -> Result<Summary> {
-        let recorder = self.options.record.as_deref().map(Recorder::start).transpose()?;
+        let Server { listener, options, recorder } = self;
         let shared = Shared {
-            options: &self.options,
+            options: &options,
             pilot: Mutex::new(pilot),
             seat: Seat::default(),
-            journal: Journal::new(console, self.options.check),
+            journal: Journal::new(console, options.check),
             recorder,
             recording_failed: AtomicBool::new(false),
             stop,
             registry: Registry::new(MAX_CONNECTIONS),
             statistics: Mutex::default(),
         };
-        let connections = std::thread::scope(|scope| self.listen(scope, &shared, console));
+        let connections = std::thread::scope(|scope| listen(&listener, scope, &shared, console));
         let events = shared.journal.counts();
         let recorded = shared.recorder.map(Recorder::finish).transpose()?;
         let statistics = shared.statistics.into_inner().unwrap_or_else(PoisonError::into_inner);
@@ -233,44 +235,44 @@ impl Server {
             recorded,
         })
     }
+}
 
-    /// Accepts connections until it is told to stop; returns their number.
-    fn listen<'scope, 'env>(
-        &self,
-        scope: &'scope Scope<'scope, 'env>,
-        shared: &'env Shared<'env>,
-        console: &dyn Console,
-    ) -> u64 {
-        let began = Instant::now();
-        let (mut connections, mut lonely) = (0, true);
-        let mut last_status = began;
-        while !shared.stop.load(Ordering::Relaxed) && !shared.recording_failed.load(Ordering::Relaxed) {
-            match self.listener.accept() {
-                Ok((stream, address)) => {
-                    connections += 1;
-                    lonely = false;
-                    admit(scope, shared, connections, stream, address);
-                }
-                // Nobody there, or the connection is gone already, or the process has no file left for it.
-                Err(_) => std::thread::sleep(LISTEN_PAUSE),
+/// Accepts connections until it is told to stop; returns their number.
+fn listen<'scope, 'env>(
+    listener: &TcpListener,
+    scope: &'scope Scope<'scope, 'env>,
+    shared: &'env Shared<'env>,
+    console: &dyn Console,
+) -> u64 {
+    let began = Instant::now();
+    let (mut connections, mut lonely) = (0, true);
+    let mut last_status = began;
+    while !shared.stop.load(Ordering::Relaxed) && !shared.recording_failed.load(Ordering::Relaxed) {
+        match listener.accept() {
+            Ok((stream, address)) => {
+                connections += 1;
+                lonely = false;
+                admit(scope, shared, connections, stream, address);
             }
-            let since = last_status.elapsed();
-            if since >= STATUS_INTERVAL {
-                last_status = Instant::now();
-                let status = shared.statistics().status(since.as_secs_f64());
-                if let Some(status) = status {
-                    console.status(&status);
-                }
-                if lonely && began.elapsed() >= LONELY {
-                    lonely = false;
-                    shared.journal.report(Event::NobodyConnects, format_args!("nobody has connected yet"));
-                }
+            // Nobody there, or the connection is gone already, or the process has no file left for it.
+            Err(_) => std::thread::sleep(LISTEN_PAUSE),
+        }
+        let since = last_status.elapsed();
+        if since >= STATUS_INTERVAL {
+            last_status = Instant::now();
+            let status = shared.statistics().status(since.as_secs_f64());
+            if let Some(status) = status {
+                console.status(&status);
+            }
+            if lonely && began.elapsed() >= LONELY {
+                lonely = false;
+                shared.journal.report(Event::NobodyConnects, format_args!("nobody has connected yet"));
             }
         }
-        // Threads that serve a connection look at `stop`; a failed recording ends them, too.
-        shared.stop.store(true, Ordering::Relaxed);
-        connections
     }
+    // Threads that serve a connection look at `stop`; a failed recording ends them, too.
+    shared.stop.store(true, Ordering::Relaxed);
+    connections
 }
 
 fn admit<'scope, 'env>(

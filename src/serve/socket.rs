@@ -1,7 +1,7 @@
 //! A TCP connection that knows when its last byte came, and comes back to its owner at a steady beat.
 
-use std::io::{self, Read, Write};
-use std::net::TcpStream;
+use std::io::{self, ErrorKind, Read, Write};
+use std::net::{Shutdown, TcpStream};
 use std::time::{Duration, Instant};
 
 /// Longest time that sending may block: a client that does not read is given up.
@@ -16,6 +16,7 @@ pub(super) struct Socket {
     beat: Duration,
     beat_began: Instant,
     waiting: bool,
+    count: usize,
 }
 
 impl Socket {
@@ -26,12 +27,17 @@ impl Socket {
         stream.set_write_timeout(Some(WRITE_TIMEOUT))?;
         stream.set_read_timeout(Some(beat))?;
         let now = Instant::now();
-        Ok(Socket { stream, last_byte: now, beat, beat_began: now, waiting: true })
+        Ok(Socket { stream, last_byte: now, beat, beat_began: now, waiting: true, count: 0 })
     }
 
     /// When the last byte came.
     pub fn last_byte(&self) -> Instant {
         self.last_byte
+    }
+
+    /// Bytes read since this was last asked.
+    pub fn take_count(&mut self) -> usize {
+        std::mem::take(&mut self.count)
     }
 
     /// Changes the beat.
@@ -57,6 +63,22 @@ impl Socket {
         Ok(())
     }
 
+    /// Tells the client that nothing more comes, and reads on for at most `patience` until it has left. If bytes remained
+    /// unread when the connection is closed, the system would take back what was sent last.
+    pub fn finish(&mut self, patience: Duration) {
+        // Whoever is gone needs no farewell.
+        let _ = self.stream.shutdown(Shutdown::Write);
+        let began = Instant::now();
+        let mut rest = [0; 4096];
+        while began.elapsed() < patience {
+            match self.stream.read(&mut rest) {
+                Ok(0) => return,
+                Err(error) if !is_timeout(&error) => return,
+                _ => {}
+            }
+        }
+    }
+
     /// Acknowledges what has come at once. The simulator sends a message in pieces and waits for the acknowledgement of one
     /// before it sends the last (Nagle's algorithm), which the system would otherwise delay by up to 40 ms.
     #[cfg(target_os = "linux")]
@@ -70,13 +92,19 @@ impl Socket {
     fn acknowledge(&self) {}
 }
 
+/// Whether an error only says that nothing has come yet.
+pub(super) fn is_timeout(error: &io::Error) -> bool {
+    matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted)
+}
+
 impl Read for Socket {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         if self.waiting && self.beat_began.elapsed() >= self.beat {
-            return Err(io::ErrorKind::WouldBlock.into());
+            return Err(ErrorKind::WouldBlock.into());
         }
         let len = self.stream.read(buffer)?;
         self.last_byte = Instant::now();
+        self.count += len;
         self.acknowledge();
         Ok(len)
     }
@@ -84,7 +112,10 @@ impl Read for Socket {
 
 impl Write for Socket {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        self.stream.write(bytes)
+        let len = self.stream.write(bytes)?;
+        // After a reply the system expects another and delays acknowledgements again.
+        self.acknowledge();
+        Ok(len)
     }
 
     fn flush(&mut self) -> io::Result<()> {

@@ -21,6 +21,7 @@ use super::run::{DRIVE_HZ, DriveState, Driver};
 use super::simulation::{Simulation, Start};
 use super::speed::SpeedController;
 use super::track::Track;
+use crate::new_folder::NewFolder;
 use crate::{Error, Result};
 
 /// Rows of the log for each second, unless told otherwise.
@@ -268,7 +269,8 @@ pub fn drive_and_label(
 /// and may return `false` to stop.
 ///
 /// # Errors
-/// If `out` exists, if something cannot be written, or if `progress` stopped it. What was written stays.
+/// If `out` exists, if something cannot be written, or if `progress` stopped it. Nothing is left behind then: the folder
+/// gets its name when it is whole.
 pub fn record(
     track: &Track,
     options: &RecordOptions,
@@ -299,8 +301,22 @@ pub fn write_recording(
     out: &Path,
     progress: &(dyn Fn(f64) -> bool + Sync),
 ) -> Result<RecordingInfo> {
-    create_new_folder(out)?;
-    let images = out.join("IMG");
+    let folder = NewFolder::create(out)?;
+    let info = fill(track, options, samples, &folder, out, progress).map_err(|error| folder.explain(error))?;
+    folder.finish()?;
+    Ok(info)
+}
+
+/// Writes the files of a recording into `folder`, which will be called `out`.
+fn fill(
+    track: &Track,
+    options: &RecordOptions,
+    samples: &[Sample],
+    folder: &NewFolder,
+    out: &Path,
+    progress: &(dyn Fn(f64) -> bool + Sync),
+) -> Result<RecordingInfo> {
+    let images = folder.unfinished().join("IMG");
     fs::create_dir(&images).map_err(Error::io(&images))?;
     let world = track.world();
     let variant = Variant::new(world, options.seed);
@@ -319,8 +335,8 @@ pub fn write_recording(
             if progress(count as f64 / samples.len() as f64) { Ok(()) } else { Err(Error::Interrupted) }
         },
     )?;
-    let log = out.join("driving_log.csv");
-    write_log(&log, samples, options.format).map_err(Error::io(&log))?;
+    let log = folder.unfinished().join("driving_log.csv");
+    log_text(out, samples, options.format).and_then(|text| fs::write(&log, text)).map_err(Error::io(&log))?;
     let info = RecordingInfo {
         track: track.name().to_string(),
         held_out: track.held_out(),
@@ -334,27 +350,10 @@ pub fn write_recording(
         hz: options.hz,
         rows: samples.len(),
     };
-    let side = out.join("recording.toml");
+    let side = folder.unfinished().join("recording.toml");
     let text = toml::to_string(&info).map_err(|e| Error::data(&side, e.to_string()))?;
     fs::write(&side, text).map_err(Error::io(&side))?;
     Ok(info)
-}
-
-/// Creates `out` with its parents; refuses one that exists.
-pub(crate) fn create_new_folder(out: &Path) -> Result<()> {
-    if let Some(parent) = out.parent().filter(|p| !p.as_os_str().is_empty()) {
-        fs::create_dir_all(parent).map_err(Error::io(parent))?;
-    }
-    fs::create_dir(out).map_err(|source| {
-        if source.kind() == io::ErrorKind::AlreadyExists {
-            Error::Usage(format!(
-                "{}: exists already and is not overwritten; name a new folder or remove it",
-                out.display()
-            ))
-        } else {
-            Error::Io { path: out.to_path_buf(), source }
-        }
-    })
 }
 
 /// Name of a picture taken `time_s` after noon of 1 January 2026, the simulator's fixed date.
@@ -365,10 +364,11 @@ fn image_name(mount: Mount, time_s: f64) -> String {
     format!("{}_2026_01_{day:02}_{hour:02}_{minute:02}_{second:02}_{:03}.jpg", mount.name(), ms % 1000)
 }
 
-fn write_log(log: &Path, samples: &[Sample], format: LogFormat) -> io::Result<()> {
+/// The log of a recording in the folder `out`.
+fn log_text(out: &Path, samples: &[Sample], format: LogFormat) -> io::Result<Vec<u8>> {
     let (separator, folder) = match format {
         LogFormat::Sample => (", ", PathBuf::from("IMG")),
-        LogFormat::V2 => (",", std::path::absolute(log)?.with_file_name("IMG")),
+        LogFormat::V2 => (",", std::path::absolute(out)?.join("IMG")),
     };
     let mut text = Vec::new();
     if format == LogFormat::Sample {
@@ -386,7 +386,7 @@ fn write_log(log: &Path, samples: &[Sample], format: LogFormat) -> io::Result<()
             [sample.steering, sample.throttle, sample.brake, sample.speed_mph].map(|v| (v as f32).to_string());
         writeln!(text, "{}", numbers.join(separator))?;
     }
-    fs::write(log, text)
+    Ok(text)
 }
 
 #[cfg(test)]

@@ -5,3 +5,4 @@ pub mod command;
 pub mod double;
 pub mod formula;
 pub mod painted_log;
+pub mod served;

@@ -20,6 +20,38 @@ pub(crate) fn align(scratch: &mut [f32]) -> &mut [f32] {
     &mut scratch[skip.min(ALIGNMENT)..]
 }
 
+/// The `LANES` elements from `at` on.
+#[inline(always)]
+pub(crate) fn get<S: Simd>(simd: S, from: &[f32], at: usize) -> S::V {
+    let from = &from[at..at + S::LANES];
+    // SAFETY: the slice has `LANES` elements.
+    unsafe { simd.load(from.as_ptr()) }
+}
+
+/// Writes the `LANES` elements from `at` on.
+#[inline(always)]
+pub(crate) fn put<S: Simd>(simd: S, to: &mut [f32], at: usize, v: S::V) {
+    let to = &mut to[at..at + S::LANES];
+    // SAFETY: the slice has `LANES` elements.
+    unsafe { simd.store(to.as_mut_ptr(), v) };
+}
+
+/// Twice `LANES` elements from `at` on, those at even places first.
+#[inline(always)]
+pub(crate) fn get_pairs<S: Simd>(simd: S, from: &[f32], at: usize) -> [S::V; 2] {
+    let from = &from[at..at + 2 * S::LANES];
+    // SAFETY: the slice has twice `LANES` elements.
+    unsafe { simd.load_pairs(from.as_ptr()) }
+}
+
+/// The reverse of [`get_pairs`].
+#[inline(always)]
+pub(crate) fn put_pairs<S: Simd>(simd: S, to: &mut [f32], at: usize, v: [S::V; 2]) {
+    let to = &mut to[at..at + 2 * S::LANES];
+    // SAFETY: the slice has twice `LANES` elements.
+    unsafe { simd.store_pairs(to.as_mut_ptr(), v) };
+}
+
 /// Vectors of `LANES` values of `f32`.
 pub(crate) trait Simd: Copy {
     /// A vector.

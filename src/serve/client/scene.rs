@@ -56,7 +56,7 @@ pub struct ClientOptions {
     pub manual_s: Option<(f64, f64)>,
     /// Simulated time at which the scene is left and entered again, s: the connection ends without a word, the car starts anew.
     pub scene_change_s: Option<f64>,
-    /// Replies after which to stop.
+    /// Answered telemetries after which to stop.
     pub frames: Option<u64>,
     /// Longest time without a reply, s.
     pub patience_s: f64,
@@ -92,8 +92,10 @@ pub struct ClientReport {
     pub manual_telemetries: u64,
     /// Commands that could be read.
     pub commands: u64,
-    /// `manual` events.
+    /// `manual` events in reply to `null`.
     pub manuals: u64,
+    /// `manual` events out of turn: the server asked for telemetry.
+    pub questions: u64,
     /// Commands that could not be read, so that their token was lost.
     pub tokens_lost: u64,
     /// WebSocket connections.
@@ -161,6 +163,13 @@ fn check(options: &ClientOptions) -> Result<()> {
     Ok(())
 }
 
+/// A telemetry on its way.
+struct Sent {
+    at: Instant,
+    /// It was `null`: somebody drives by hand.
+    by_hand: bool,
+}
+
 struct Scene<'a> {
     track: &'a Track,
     options: &'a ClientOptions,
@@ -175,8 +184,8 @@ struct Scene<'a> {
     due: u64,
     /// The last command: steering and throttle.
     command: (f32, f32),
-    /// When the last telemetry was sent, until its reply comes.
-    sent: Option<Instant>,
+    /// The last telemetry that was sent, until its reply comes.
+    sent: Option<Sent>,
     /// Time without a reply, s.
     silence_s: f64,
     /// When the first connection opened.
@@ -194,12 +203,14 @@ struct Scene<'a> {
 
 impl<'a> Scene<'a> {
     fn new(track: &'a Track, options: &'a ClientOptions, observer: &'a mut dyn Observer) -> Scene<'a> {
+        // The world takes a while to build, and a server does not like to wait for the first telemetry.
+        let eye = Eye::new(track, options.seed);
         Scene {
             track,
             options,
             observer,
             connection: Connection::start(&options.url, options.numbers, options.seed),
-            eye: Eye::new(track, options.seed),
+            eye,
             image: String::new(),
             image_step: None,
             message: String::new(),
@@ -244,7 +255,7 @@ impl<'a> Scene<'a> {
             }
         };
         while closed_loop.goes_on()
-            && self.options.frames.is_none_or(|most| self.replies() < most)
+            && self.options.frames.is_none_or(|most| self.answers() < most)
             && leave_at_s.is_none_or(|at| closed_loop.simulation().time_s() < at)
         {
             match &mut clock {
@@ -278,13 +289,12 @@ impl<'a> Scene<'a> {
             while self.due > 0 {
                 self.send_telemetry(closed_loop)?;
             }
-            let by_hand = self.by_hand(closed_loop);
-            // A reply that brings no command, or a new connection, is one more turn for the same frame.
-            let before = (self.report.commands, self.report.manuals);
+            // A question, an unreadable command or a new connection is one more turn for the same frame.
+            let before = self.answers();
             while self.due == 0 {
                 self.wait()?;
             }
-            if self.report.commands > before.0 || (by_hand && self.report.manuals > before.1) {
+            if self.answers() > before {
                 return Ok(());
             }
         }
@@ -300,10 +310,13 @@ impl<'a> Scene<'a> {
 
     /// Waits a little for something to happen.
     fn wait(&mut self) -> Result<()> {
-        match self.connection.wait(Duration::from_secs_f64(TICK_S)) {
-            Some(event) => self.take(event),
-            None => self.be_patient(TICK_S)?,
+        let began = Instant::now();
+        let event = self.connection.wait(Duration::from_secs_f64(TICK_S));
+        let waited_s = began.elapsed().as_secs_f64().min(TICK_S);
+        if let Some(event) = event {
+            self.take(event);
         }
+        self.be_patient(waited_s)?;
         if self.observer.progress(self.share) { Ok(()) } else { Err(Error::Interrupted) }
     }
 
@@ -352,7 +365,8 @@ impl<'a> Scene<'a> {
         }))
     }
 
-    fn replies(&self) -> u64 {
+    /// Telemetries that were answered.
+    fn answers(&self) -> u64 {
         self.report.commands + self.report.manuals
     }
 
@@ -381,7 +395,10 @@ impl<'a> Scene<'a> {
                 }
             }
             Event::Manual(arrived) => {
-                self.report.manuals += 1;
+                match self.sent {
+                    Some(Sent { by_hand: true, .. }) => self.report.manuals += 1,
+                    _ => self.report.questions += 1,
+                }
                 self.reply(arrived);
             }
             Event::Closed(why) => {
@@ -409,7 +426,7 @@ impl<'a> Scene<'a> {
         self.due += 1;
         self.silence_s = 0.0;
         if let Some(sent) = self.sent.take() {
-            self.report.round_trips_ms.push(arrived.saturating_duration_since(sent).as_secs_f64() * 1000.0);
+            self.report.round_trips_ms.push(arrived.saturating_duration_since(sent.at).as_secs_f64() * 1000.0);
         }
     }
 
@@ -428,7 +445,8 @@ impl<'a> Scene<'a> {
         self.due -= 1;
         self.message.clear();
         let simulation = closed_loop.simulation();
-        if self.by_hand(closed_loop) {
+        let by_hand = self.by_hand(closed_loop);
+        if by_hand {
             self.message.push_str("42[\"telemetry\",null]");
             self.report.manual_telemetries += 1;
         } else {
@@ -452,7 +470,7 @@ impl<'a> Scene<'a> {
             print_telemetry(&mut self.message, &readings, mark);
             self.report.telemetries += 1;
         }
-        self.sent = Some(Instant::now());
+        self.sent = Some(Sent { at: Instant::now(), by_hand });
         self.connection.send(&self.message);
         Ok(())
     }

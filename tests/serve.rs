@@ -1,0 +1,436 @@
+//! `steersman serve` as a black box, driven by the built-in simulator and by clients of other habits.
+#![cfg(unix)]
+
+mod common;
+
+use std::io::Write;
+use std::path::Path;
+use std::time::Duration;
+
+use common::command::{error, json};
+use common::served::{Client, Served, command, random_model, sample_jpeg, telemetry};
+use serde_json::Value;
+use steersman::pilot::Pilot;
+use steersman::serve::client::{ClientOptions, ClientReport, Numbers, Observer, Pace, drive};
+use steersman::serve::protocol::DecimalMark;
+use steersman::simulator::run::run;
+use steersman::simulator::{RunOptions, Speed, Track};
+
+/// Long enough for an answer that must not come. (Where the machine stands still, a wrong answer could be missed, not invented.)
+const QUIET: Duration = Duration::from_millis(400);
+
+struct Silent;
+
+impl Observer for Silent {
+    fn notice(&mut self, _: &str) {}
+    fn progress(&mut self, _: f64) -> bool {
+        true
+    }
+}
+
+/// A folder with `model`, a small network with random weights.
+fn folder_with_model() -> tempfile::TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    random_model(&folder.path().join("model"), "lenet");
+    folder
+}
+
+/// A server at the speed of `drive`.
+fn serve(folder: &tempfile::TempDir, args: &[&str]) -> Served {
+    Served::start(folder.path(), "model", &[&["--speed", "20"], args].concat())
+}
+
+fn lockstep(served: &Served) -> ClientOptions {
+    ClientOptions {
+        url: format!("ws://127.0.0.1:{}", served.port).parse().unwrap(),
+        seed: 2,
+        pace: Pace::Lockstep,
+        patience_s: 120.0,
+        ..ClientOptions::default()
+    }
+}
+
+fn drive_lake(options: &ClientOptions) -> ClientReport {
+    drive(&Track::load("lake").unwrap(), options, &mut Silent).unwrap()
+}
+
+fn count(value: &Value, name: &str) -> u64 {
+    value[name].as_u64().unwrap_or_else(|| panic!("{name} in {value}"))
+}
+
+#[test]
+fn in_lockstep_the_way_through_the_server_is_the_way_of_drive_bit_for_bit_in_every_language() {
+    let folder = folder_with_model();
+    let served = serve(&folder, &[]);
+    let mut pilot = Pilot::load(&folder.path().join("model")).unwrap();
+    let options = RunOptions { laps: 1, speed: Speed::Fixed(20.0), latency_ms: 0.0, noise: 0.0, assisted: false };
+    let expected = run(&Track::load("lake").unwrap(), &mut pilot, &options, 2).unwrap();
+    assert!(expected.moments.len() > 30, "{} frames are too few to prove something", expected.moments.len());
+    for mark in [DecimalMark::DOT, DecimalMark::COMMA] {
+        let report = drive_lake(&ClientOptions { numbers: Numbers::Strings(mark), ..lockstep(&served) });
+        assert_eq!(report.run, expected, "{mark:?}");
+        assert_eq!((report.tokens_lost, report.connections), (0, 1));
+    }
+    let (summary, said) = served.stop();
+    assert_eq!(count(&summary, "frames"), 2 * expected.moments.len() as u64);
+    assert!(said.contains("decimal mark"), "{said}");
+}
+
+#[test]
+fn sim_and_drive_write_the_same_trajectory() {
+    let folder = folder_with_model();
+    let served = serve(&folder, &[]);
+    let url = format!("ws://127.0.0.1:{}", served.port);
+    let drive = ["drive", "model", "--track", "lake", "--runs", "1", "--seed", "5", "--out", "driven", "--json"];
+    let sim = ["sim", "--connect", &url, "--track", "lake", "--seed", "5", "--lockstep", "--out", "sim", "--json"];
+    let driven = json(folder.path(), &drive);
+    let simulated = json(folder.path(), &sim);
+    let read = |dir: &str| std::fs::read_to_string(folder.path().join(dir).join("free_5.csv")).unwrap();
+    assert_eq!(read("driven"), read("sim"));
+    for name in ["cte_mean_m", "cte_rms_m", "cte_p95_m", "distance_m", "laps_completed", "mean_speed_mph"] {
+        assert_eq!(driven[name], simulated[name], "{name}");
+    }
+    let existing = error(folder.path(), &sim);
+    assert!(existing.contains("sim: exists already"), "{existing}");
+    served.stop();
+}
+
+#[test]
+fn a_person_takes_the_wheel_and_gives_it_back() {
+    let folder = folder_with_model();
+    let served = serve(&folder, &[]);
+    let report = drive_lake(&ClientOptions { manual_s: Some((0.5, 1.0)), frames: Some(30), ..lockstep(&served) });
+    assert_eq!((report.manual_telemetries, report.manuals, report.commands), (10, 10, 20));
+    let (summary, said) = served.stop();
+    assert_eq!(count(&summary, "frames"), 20);
+    assert!(said.contains("release W and S"), "{said}");
+}
+
+#[test]
+fn a_simulator_of_the_second_term_gets_numbers() {
+    let folder = folder_with_model();
+    let served = serve(&folder, &[]);
+    let report = drive_lake(&ClientOptions { numbers: Numbers::Json, frames: Some(20), ..lockstep(&served) });
+    assert_eq!((report.commands, report.tokens_lost), (20, 0));
+    served.stop();
+}
+
+#[test]
+fn after_a_change_of_scene_the_drive_begins_anew() {
+    let folder = folder_with_model();
+    let served = serve(&folder, &[]);
+    let plain = drive_lake(&ClientOptions { frames: Some(10), ..lockstep(&served) });
+    let changed = drive_lake(&ClientOptions { scene_change_s: Some(0.5), frames: Some(20), ..lockstep(&served) });
+    assert_eq!(changed.connections, 2);
+    assert_eq!(changed.run, plain.run, "nothing of the first scene is left in the second");
+    served.stop();
+}
+
+#[test]
+fn in_real_time_it_drives_as_well_and_reports_latencies() {
+    let folder = folder_with_model();
+    let served = serve(&folder, &[]);
+    let pace = Pace::RealTime { fps: 30.0 };
+    let report = drive_lake(&ClientOptions { pace, frames: Some(40), ..lockstep(&served) });
+    assert_eq!((report.commands, report.round_trips_ms.len(), report.tokens_lost), (40, 40, 0));
+    let (summary, _) = served.stop();
+    let ms = |name: &str| summary[name].as_f64().unwrap();
+    assert!(ms("latency_p50_ms") > 0.0 && ms("latency_p50_ms") <= ms("latency_p99_ms"), "{summary}");
+    assert!(report.round_trips_ms[20] >= ms("latency_p50_ms") / 2.0, "a round trip holds the server's part");
+}
+
+#[test]
+fn what_is_recorded_while_driving_can_be_evaluated_and_no_folder_is_overwritten() {
+    let folder = folder_with_model();
+    let served = serve(&folder, &["--record", "drive"]);
+    let report = drive_lake(&ClientOptions { frames: Some(25), ..lockstep(&served) });
+    let (summary, _) = served.stop();
+    assert_eq!((count(&summary["recorded"], "rows"), count(&summary["recorded"], "dropped")), (25, 0));
+    let metrics = json(folder.path(), &["evaluate", "model", "drive", "--json"]);
+    assert_eq!(count(&metrics, "rows"), 25);
+    // The label of each frame is what this model said to it.
+    assert!(metrics["mae_deg"].as_f64().unwrap() < 0.05, "{metrics}");
+    assert!(report.run.moments.iter().any(|m| m.steering != 0.0));
+    let refused = error(folder.path(), &["serve", "model", "--port", "0", "--record", "drive"]);
+    assert!(refused.contains("drive: exists already"), "{refused}");
+}
+
+/// Drives `client` once: sends telemetry and wants a command.
+fn turn(client: &mut Client, speed: f64, jpeg: &[u8]) -> (f64, f64) {
+    client.send(&telemetry(speed, jpeg));
+    command(&client.next())
+}
+
+#[test]
+fn a_client_that_dies_in_mid_frame_makes_room_at_once() {
+    let folder = folder_with_model();
+    let served = serve(&folder, &[]);
+    let jpeg = sample_jpeg();
+    for _ in 0..3 {
+        let mut client = served.connect_simulator();
+        turn(&mut client, 10.0, &jpeg);
+        // The first half of a piece: text, not the last, masked, 1016 bytes announced and 500 sent.
+        let mut stream = client.0.get_ref();
+        stream.write_all(&[0x01, 0xfe, 0x03, 0xf8, 1, 2, 3, 4]).unwrap();
+        stream.write_all(&[0x55; 500]).unwrap();
+    }
+    let report = drive_lake(&ClientOptions { frames: Some(5), ..lockstep(&served) });
+    assert_eq!((report.commands, report.connections), (5, 1));
+    served.stop();
+}
+
+#[test]
+fn of_five_telemetries_at_once_the_newest_is_answered_and_one_goes_round() {
+    let folder = folder_with_model();
+    let served = serve(&folder, &[]);
+    let jpeg = sample_jpeg();
+    let mut client = served.connect_simulator();
+    let throttle = turn(&mut client, 19.0, &jpeg).1;
+    for speed in [1.0, 2.0, 3.0, 4.0] {
+        client.0.write(tungstenite::Message::text(telemetry(speed, &jpeg))).unwrap();
+    }
+    client.send(&telemetry(29.0, &jpeg));
+    let mut answers = vec![command(&client.next())];
+    while let Some(text) = client.next_within(QUIET) {
+        answers.push(command(&text));
+    }
+    assert!(answers.last().unwrap().1 < throttle, "the newest, at 29 mph, is answered last: {answers:?}");
+    let (summary, _) = served.stop();
+    let (frames, superseded) = (count(&summary, "frames"), count(&summary, "superseded"));
+    // Usually one answer; the pieces of five messages need not arrive in one go.
+    assert!(frames + superseded == 6 && frames <= 4, "{summary}");
+    assert_eq!(answers.len() as u64, frames - 1);
+}
+
+#[test]
+fn another_client_drives_only_when_the_first_is_silent_or_gone() {
+    let folder = folder_with_model();
+    let served = serve(&folder, &[]);
+    let jpeg = sample_jpeg();
+    let mut first = served.connect_simulator();
+    turn(&mut first, 10.0, &jpeg);
+    let mut second = served.connect_simulator();
+    second.send(&telemetry(10.0, &jpeg));
+    served.wait_until_it_says("another client drives");
+    // An open connection without telemetry takes nothing away either.
+    let idle = served.connect_simulator();
+    turn(&mut first, 10.0, &jpeg);
+    // Now the first falls silent, and the telemetry that waits is answered.
+    let answer = second.next();
+    assert!(answer.contains("steer"), "{answer}");
+    first.next_within(QUIET);
+    assert!(first.next_within(Duration::from_secs(60)).is_none(), "the silent one is closed");
+    drop(idle);
+    // One that leaves makes room at once.
+    second.0.close(None).unwrap();
+    drop(second);
+    let mut third = served.connect_simulator();
+    turn(&mut third, 10.0, &jpeg);
+    served.stop();
+}
+
+#[test]
+fn bad_telemetry_is_answered_so_that_the_car_does_not_wait_for_ever() {
+    let folder = folder_with_model();
+    let served = serve(&folder, &[]);
+    let jpeg = sample_jpeg();
+    let mut client = served.connect_simulator();
+    let (steering, throttle) = turn(&mut client, 10.0, &jpeg);
+    assert!(throttle > 0.0);
+    let good = telemetry(10.0, &jpeg);
+    // The same trouble is not reported again within seconds.
+    for (bad, words) in [
+        (good.replace("/9j/", "?9j/"), "not base64"),
+        (telemetry(10.0, &jpeg[..jpeg.len() / 2]), ""),
+        (telemetry(10.0, b"no picture at all"), ""),
+        (good.replace("\"speed\"", "\"velocity\""), "without a speed"),
+        (good.replace("\"image\"", "\"picture\""), "without an image"),
+        (good[..good.len() - 3].to_string(), "event that cannot be read"),
+    ] {
+        client.send(&bad);
+        assert_eq!(command(&client.next()), (steering, 0.0), "the wheel stays, the throttle is cut: {words}");
+        served.wait_until_it_says(words);
+        client.send(&good);
+        // On a slow machine the throttle is cut once more in between.
+        let again =
+            (0..10).map(|_| client.next()).filter(|text| text.starts_with("42[\"steer\"")).map(|text| command(&text));
+        let last = again.into_iter().find(|(_, throttle)| *throttle > 0.0);
+        assert_eq!(last.map(|(steering, _)| steering), Some(steering), "{words}");
+    }
+    served.stop();
+}
+
+#[test]
+fn fields_in_any_order_and_numbers_instead_of_strings_are_understood() {
+    let folder = folder_with_model();
+    let served = serve(&folder, &[]);
+    let image = data_encoding::BASE64.encode(&sample_jpeg());
+    let mut client = served.connect_simulator();
+    let (steering, _) = turn(&mut client, 10.0, &sample_jpeg());
+    client.send(&format!(
+        r#"42["telemetry", {{"fps": [1, {{}}], "image":"{image}", "speed":10, "throttle":0.1, "steering_angle":-3.5}}]"#
+    ));
+    assert_eq!(command(&client.next()).0, steering);
+    served.stop();
+}
+
+#[test]
+fn without_telemetry_the_throttle_is_cut_and_the_simulator_is_asked() {
+    let folder = folder_with_model();
+    let served = serve(&folder, &[]);
+    let mut client = served.connect_simulator();
+    let (steering, throttle) = turn(&mut client, 10.0, &sample_jpeg());
+    assert!(throttle > 0.0);
+    assert_eq!(command(&client.next()), (steering, 0.0));
+    assert_eq!(client.next(), r#"42["manual",{}]"#);
+    served.wait_until_it_says("no telemetry for");
+    turn(&mut client, 10.0, &sample_jpeg());
+    served.stop();
+}
+
+#[test]
+fn pings_are_answered_in_whatever_order() {
+    let folder = folder_with_model();
+    let served = serve(&folder, &[]);
+    let mut client = served.connect_simulator();
+    client.send("2");
+    assert_eq!(client.next(), "3");
+    client.send(&telemetry(10.0, &sample_jpeg()));
+    client.send("2");
+    let mut answers = [client.next(), client.next()];
+    answers.sort();
+    assert!(answers[0] == "3" && answers[1].starts_with(r#"42["steer""#), "{answers:?}");
+    served.stop();
+}
+
+#[test]
+fn at_the_end_the_car_is_told_to_roll() {
+    let folder = folder_with_model();
+    let served = serve(&folder, &[]);
+    let mut client = served.connect_simulator();
+    let (steering, _) = turn(&mut client, 10.0, &sample_jpeg());
+    let reader = std::thread::spawn(move || {
+        let last = client.next();
+        (last, client.next_within(Duration::from_secs(60)))
+    });
+    served.stop();
+    let (last, end) = reader.join().unwrap();
+    assert_eq!((command(&last), end), ((steering, 0.0), None));
+}
+
+#[test]
+fn ordinary_clients_of_socket_io_are_greeted_as_they_expect() {
+    let folder = folder_with_model();
+    let served = serve(&folder, &[]);
+    let jpeg = sample_jpeg();
+    let open = |client: &mut Client| -> Value {
+        let open = client.next();
+        serde_json::from_str(open.strip_prefix('0').unwrap_or_else(|| panic!("{open}"))).unwrap()
+    };
+
+    let mut old = served.connect("node-XMLHttpRequest", 3);
+    let opened = open(&mut old);
+    assert!(opened["sid"].as_str().is_some_and(|sid| sid.len() >= 16) && opened["pingInterval"].is_u64(), "{opened}");
+    assert_eq!(old.next(), "40");
+    turn(&mut old, 10.0, &jpeg);
+    old.send("2");
+    assert_eq!(old.next_within(Duration::from_secs(60)).unwrap(), "3");
+    drop(old);
+
+    let mut new = served.connect("", 4);
+    let opened = open(&mut new);
+    assert!(opened["maxPayload"].is_u64(), "{opened}");
+    assert_eq!(new.next_within(QUIET), None, "it has to ask for the namespace");
+    new.send("40");
+    let connected = new.next();
+    assert!(connected.starts_with(r#"40{"sid":"#), "{connected}");
+    turn(&mut new, 10.0, &jpeg);
+    served.stop();
+}
+
+/// The headers of a handshake, without the empty line.
+const HANDSHAKE: &str = "GET /socket.io/?EIO=4&transport=websocket HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\n\
+     Connection: Upgrade\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n";
+
+#[test]
+fn requests_that_are_refused_get_a_sentence_with_the_remedy() {
+    let folder = folder_with_model();
+    let served = serve(&folder, &["--allow-origin", "http://localhost:8000"]);
+    let polling = served.ask("GET /socket.io/?EIO=4&transport=polling HTTP/1.1\r\nHost: x\r\n\r\n");
+    assert!(polling.starts_with("HTTP/1.1 400") && polling.contains("transports=['websocket']"), "{polling}");
+    let page = served.ask(&format!("{HANDSHAKE}Origin: http://evil.example\r\n\r\n"));
+    assert!(page.starts_with("HTTP/1.1 403") && page.contains("--allow-origin"), "{page}");
+    let nonsense = served.ask("HELO there\r\n\r\n");
+    assert!(nonsense.starts_with("HTTP/1.1 400"), "{nonsense}");
+
+    let mut allowed = served.connect_tcp();
+    allowed.write_all(format!("{HANDSHAKE}Origin: http://localhost:8000\r\n\r\n").as_bytes()).unwrap();
+    let mut answer = [0; 12];
+    std::io::Read::read_exact(&mut allowed, &mut answer).unwrap();
+    assert_eq!(&answer, b"HTTP/1.1 101");
+    served.stop();
+}
+
+#[test]
+fn nothing_is_negotiated_that_the_simulator_would_refuse() {
+    let folder = folder_with_model();
+    let served = serve(&folder, &[]);
+    let offer = "Sec-WebSocket-Extensions: permessage-deflate\r\nSec-WebSocket-Protocol: chat\r\n";
+    let mut client = served.connect_tcp();
+    client.write_all(format!("{HANDSHAKE}{offer}\r\n").as_bytes()).unwrap();
+    let mut answer = Vec::new();
+    while !answer.ends_with(b"\r\n\r\n") {
+        let mut byte = [0];
+        std::io::Read::read_exact(&mut client, &mut byte).unwrap();
+        answer.push(byte[0]);
+    }
+    let answer = String::from_utf8(answer).unwrap();
+    assert!(answer.contains("Sec-WebSocket-Accept: s3pPLMBiTxaQ9kYGzzhZRbK+xOo="), "{answer}");
+    assert!(!answer.contains("Extensions") && !answer.contains("WebSocket-Protocol"), "{answer}");
+    served.stop();
+}
+
+#[test]
+fn wrong_ports_are_named_on_both_sides() {
+    let folder = folder_with_model();
+    let served = serve(&folder, &[]);
+    let port = served.port.to_string();
+    let taken = error(folder.path(), &["serve", "model", "--port", &port]);
+    assert!(taken.contains(&port) && taken.contains("--port"), "{taken}");
+    served.stop();
+    let url = format!("ws://127.0.0.1:{port}");
+    let nobody = error(folder.path(), &["sim", "--connect", &url, "--track", "lake", "--patience", "0.5"]);
+    assert!(nobody.contains(&url) && nobody.contains("steersman serve"), "{nobody}");
+}
+
+#[test]
+fn check_shows_the_handshake_and_both_sides() {
+    let folder = folder_with_model();
+    let served = serve(&folder, &["--check"]);
+    drive_lake(&ClientOptions { frames: Some(3), ..lockstep(&served) });
+    let (_, said) = served.stop();
+    for words in [
+        "GET /socket.io/?EIO=4&transport=websocket HTTP/1.1",
+        "User-Agent: websocket-sharp/1.0",
+        "101 Switching Protocols",
+        r#"> 42["telemetry",{"steering_angle":"0.0000""#,
+        r#"< 42["steer",{"steering_angle":""#,
+    ] {
+        assert!(said.contains(words), "{words} in {said}");
+    }
+}
+
+#[test]
+fn bad_arguments_of_sim_are_errors_with_a_remedy() {
+    let folder = tempfile::tempdir().unwrap();
+    let sim = |args: &[&str]| error(folder.path(), &[&["sim", "--track", "lake"], args].concat());
+    assert!(sim(&["--fps", "0"]).contains("1 to 1000"));
+    assert!(sim(&["--manual", "5:2"]).contains("the end must come after"));
+    assert!(error(folder.path(), &["sim", "--track", "lakke"]).contains("lake"));
+    for args in [&["--connect", "http://127.0.0.1"][..], &["--manual", "5"], &["--lockstep", "--fps", "10"]] {
+        let output =
+            common::command::steersman(folder.path()).args(["sim", "--track", "lake"]).args(args).output().unwrap();
+        assert_eq!(output.status.code(), Some(2), "{args:?}");
+    }
+    assert!(!Path::new(&folder.path().join("sim")).exists());
+}
