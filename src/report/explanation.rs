@@ -135,6 +135,9 @@ fn features(pilot: &mut Pilot, image: &RgbImage) -> Result<Vec<Exhibit>> {
                 LayerSpec::BatchNorm { .. }
                     | LayerSpec::Relu {}
                     | LayerSpec::Elu { .. }
+                    | LayerSpec::LeakyRelu { .. }
+                    | LayerSpec::Tanh {}
+                    | LayerSpec::Softsign {}
                     | LayerSpec::PRelu { .. }
                     | LayerSpec::Dropout { .. }
                     | LayerSpec::Scale { .. }

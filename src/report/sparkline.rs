@@ -27,7 +27,7 @@ mod tests {
 
     #[test]
     fn heights_follow_the_logarithm_of_the_values() {
-        assert_eq!(sparkline(&[10.0, 1.0, 0.1], 10), "█▅▁");
+        assert_eq!(sparkline(&[8.0, 4.0, 1.0], 10), "█▆▁");
         assert_eq!(sparkline(&[-1.0, 0.0, 1.0], 10), "▁▅█");
         assert_eq!(sparkline(&[2.0, f64::NAN, 2.0], 10), "▄ ▄");
         assert_eq!(sparkline(&[], 10), "");
