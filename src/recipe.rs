@@ -31,6 +31,9 @@ pub const SHIPPED: [(&str, &str); 5] = [
     ("pilotnet", include_str!("../data/recipes/pilotnet.toml")),
 ];
 
+/// Longer networks are refused.
+const MAX_LAYERS: usize = 1000;
+
 /// A whole experiment.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -194,6 +197,9 @@ impl Recipe {
         if self.name.is_empty() || self.name.starts_with('.') || !self.name.chars().all(allowed) {
             return Err(format!("name must consist of letters, digits, - and _, not be `{}`", self.name));
         }
+        if self.layers.len() > MAX_LAYERS {
+            return Err(format!("layers: {} are more than {MAX_LAYERS}", self.layers.len()));
+        }
         if self.epochs == 0 || self.batch == 0 {
             return Err("epochs and batch must be at least 1".into());
         }
@@ -354,6 +360,8 @@ mod tests {
         assert!(error(&["name='../x'"]).contains("letters, digits"));
         assert!(error(&["early_stopping={patience_epochs=1}", "split.validation_share=0"]).contains("validation side"));
         assert!(error(&["layers=[{kind='dense', units=100000000000000}]"]).contains("units"));
+        let many = format!("layers=[{}]", "{kind='relu'},".repeat(1001));
+        assert!(error(&[&many]).contains("1001 are more than 1000"));
         assert!(error(&["layers=[{kind='conv2d', filters=60000, kernel=[3, 3]}]"]).contains("more than"));
     }
 }

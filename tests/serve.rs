@@ -252,7 +252,8 @@ fn bad_telemetry_is_answered_so_that_the_car_does_not_wait_for_ever() {
         served.wait_until_it_says(words);
         client.send(&good);
         // On a slow machine the throttle is cut once more in between.
-        let again = (0..10).map(|_| client.next()).filter(|text| text.starts_with("42[\"steer\"")).map(|text| command(&text));
+        let again =
+            (0..10).map(|_| client.next()).filter(|text| text.starts_with("42[\"steer\"")).map(|text| command(&text));
         let last = again.into_iter().find(|(_, throttle)| *throttle > 0.0);
         assert_eq!(last.map(|(steering, _)| steering), Some(steering), "{words}");
     }
@@ -427,7 +428,8 @@ fn bad_arguments_of_sim_are_errors_with_a_remedy() {
     assert!(sim(&["--manual", "5:2"]).contains("the end must come after"));
     assert!(error(folder.path(), &["sim", "--track", "lakke"]).contains("lake"));
     for args in [&["--connect", "http://127.0.0.1"][..], &["--manual", "5"], &["--lockstep", "--fps", "10"]] {
-        let output = common::command::steersman(folder.path()).args(["sim", "--track", "lake"]).args(args).output().unwrap();
+        let output =
+            common::command::steersman(folder.path()).args(["sim", "--track", "lake"]).args(args).output().unwrap();
         assert_eq!(output.status.code(), Some(2), "{args:?}");
     }
     assert!(!Path::new(&folder.path().join("sim")).exists());

@@ -380,6 +380,11 @@ fn no_server_and_a_server_without_a_word_are_errors_with_a_remedy() {
     let silent = message(drive(&track, &impatient(port), &mut Silent));
     assert!(silent.contains("no reply to telemetry"), "{silent}");
     let _ = server.join().unwrap();
+
+    // Closes every connection at once; its thread ends with the test.
+    let (port, _) = start(|listener| listener.incoming().for_each(drop));
+    let closing = message(drive(&track, &impatient(port), &mut Silent));
+    assert!(closing.contains("steersman serve"), "{closing}");
 }
 
 #[test]

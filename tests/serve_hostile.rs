@@ -85,14 +85,14 @@ const KINDS: [Kind; 8] = [
     }),
     ("broken frames", |port, turn| {
         const FRAMES: [&[u8]; 8] = [
-            b"\xf1\x80\0\0\0\0",                                // reserved bits
-            b"\x81\x05hello",                                   // no mask
-            b"\x80\x81\0\0\0\0a",                               // continuation of nothing
-            b"\x01\x81\0\0\0\0a\x81\x81\0\0\0\0b",              // a text within a text
-            b"\x09\x80\0\0\0\0",                                // a ping in pieces
-            b"\x89\xfe\x00\x80\0\0\0\0",                        // a ping that is too long
-            b"\x81\x84\0\0\0\0\xff\xfe\xfd\xfc",                // no UTF-8
-            b"\x83\x80\0\0\0\0",                                // unknown opcode
+            b"\xf1\x80\0\0\0\0",                   // reserved bits
+            b"\x81\x05hello",                      // no mask
+            b"\x80\x81\0\0\0\0a",                  // continuation of nothing
+            b"\x01\x81\0\0\0\0a\x81\x81\0\0\0\0b", // a text within a text
+            b"\x09\x80\0\0\0\0",                   // a ping in pieces
+            b"\x89\xfe\x00\x80\0\0\0\0",           // a ping that is too long
+            b"\x81\x84\0\0\0\0\xff\xfe\xfd\xfc",   // no UTF-8
+            b"\x83\x80\0\0\0\0",                   // unknown opcode
         ];
         let mut attack = Attack::open(port)?;
         attack.say(FRAMES[turn as usize % FRAMES.len()])?;
@@ -120,9 +120,22 @@ const KINDS: [Kind; 8] = [
     ("malformed messages", |port, turn| {
         let deep = format!("42{}", "[".repeat(100_000));
         let texts = [
-            "", "x", "4", "42", "42[", "42{}", "42[\"telemetry\"", "42[\"telemetry\",[]]", "42[\"telemetry\",{\"image\":1}]",
-            "42[null,null]", "42[\"telemetry\",{\"speed\":\"1e999\",\"image\":\"\"}]", "{\"telemetry\":{}}", "9", "451-[]",
-            "42/admin,[\"x\"]", &deep,
+            "",
+            "x",
+            "4",
+            "42",
+            "42[",
+            "42{}",
+            "42[\"telemetry\"",
+            "42[\"telemetry\",[]]",
+            "42[\"telemetry\",{\"image\":1}]",
+            "42[null,null]",
+            "42[\"telemetry\",{\"speed\":\"1e999\",\"image\":\"\"}]",
+            "{\"telemetry\":{}}",
+            "9",
+            "451-[]",
+            "42/admin,[\"x\"]",
+            &deep,
         ];
         let mut attack = Attack::open(port)?;
         for k in 0..6 {
@@ -143,7 +156,9 @@ const KINDS: [Kind; 8] = [
                 huge[at + 5..at + 9].fill(0xff);
                 huge
             }
-            2 => good.iter().enumerate().map(|(at, byte)| if at > 700 && at % 7 == 0 { !byte } else { *byte }).collect(),
+            2 => {
+                good.iter().enumerate().map(|(at, byte)| if at > 700 && at % 7 == 0 { !byte } else { *byte }).collect()
+            }
             3 => {
                 let mut plain = Vec::new();
                 let encoder = jpeg_encoder::Encoder::new(&mut plain, 60);
@@ -173,10 +188,13 @@ const KINDS: [Kind; 8] = [
             0 => {
                 attack.say(b"GET / HTTP/1.1\r\n")?;
                 for _ in 0..200 {
-                    attack.say(b"X-Header: 0123456789012345678901234567890123456789012345678901234567890123456789\r\n")?;
+                    attack
+                        .say(b"X-Header: 0123456789012345678901234567890123456789012345678901234567890123456789\r\n")?;
                 }
             }
-            1 => attack.say(b"POST /socket.io/?EIO=4&transport=polling HTTP/1.1\r\nContent-Length: 999999999\r\n\r\n")?,
+            1 => {
+                attack.say(b"POST /socket.io/?EIO=4&transport=polling HTTP/1.1\r\nContent-Length: 999999999\r\n\r\n")?
+            }
             2 => attack.say(b"GET http://[ HTTP/9.9\r\n\r\n")?,
             _ => attack.say(&[b'\n'; 20_000])?,
         }

@@ -4,9 +4,12 @@
 //! JSON value. Exit codes: 0 done, 1 error, 2 wrong arguments, 130 interrupted.
 
 mod bench;
+mod compare;
 mod drive;
 mod evaluate;
 mod experiment;
+mod explain;
+mod import;
 mod inspect;
 mod predict;
 mod progress;
@@ -51,8 +54,11 @@ enum Command {
     Predict(predict::PredictArgs),
     Inspect(inspect::InspectArgs),
     Tracks(tracks::TracksArgs),
+    Explain(explain::ExplainArgs),
+    Compare(compare::CompareArgs),
     Summary(summary::SummaryArgs),
     Bench(bench::BenchArgs),
+    Import(import::ImportArgs),
 }
 
 /// Runs the command line of this process.
@@ -69,8 +75,11 @@ pub fn main() -> ExitCode {
         Command::Predict(args) => predict::run(args),
         Command::Inspect(args) => inspect::run(args),
         Command::Tracks(args) => tracks::run(args),
+        Command::Explain(args) => explain::run(args),
+        Command::Compare(args) => compare::run(args),
         Command::Summary(args) => summary::run(args),
         Command::Bench(args) => bench::run(args, started),
+        Command::Import(args) => import::run(args),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,

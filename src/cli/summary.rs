@@ -97,6 +97,9 @@ pub fn run(args: SummaryArgs) -> Result<()> {
 
 fn training_line(model: &Model) -> String {
     let record = &model.record;
+    if record.epochs == 0 && record.recordings.is_empty() {
+        return "not trained here".into();
+    }
     format!(
         "{} epochs on {} (seed {}, {}), validation MSE {}",
         record.epochs,

@@ -21,7 +21,7 @@ pub enum Padding {
 
 impl Padding {
     /// Zeros before and after, along one axis.
-    fn amounts(self, size: usize, kernel: usize, stride: usize) -> (usize, usize) {
+    pub(crate) fn amounts(self, size: usize, kernel: usize, stride: usize) -> (usize, usize) {
         match self {
             Padding::Valid => (0, 0),
             Padding::Same => {

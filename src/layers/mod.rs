@@ -34,10 +34,11 @@ mod pool;
 mod pooled_conv;
 mod prelu;
 mod scale;
+mod zero_pad;
 
 use std::fmt::Debug;
 
-pub use activation::{Elu, Relu};
+pub use activation::{Elu, LeakyRelu, Relu, Softsign, Tanh};
 pub use batch_norm::BatchNorm;
 pub use conv2d::{Conv2d, Padding};
 pub use crop::Crop;
@@ -49,6 +50,7 @@ pub use pool::{AveragePool, MaxPool};
 pub use pooled_conv::{PooledConv, Rising};
 pub use prelu::{PRelu, Slopes};
 pub use scale::Scale;
+pub use zero_pad::ZeroPad;
 
 use crate::tensor::{Fans, Initializer, Shape};
 

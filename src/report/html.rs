@@ -16,6 +16,7 @@ p { max-width: 860px; margin: 8px 0; }
 table { border-collapse: collapse; margin: 12px 0; font-size: 14px; }
 th { text-align: left; border-bottom: 2px solid #1a1a1a; padding: 4px 14px 4px 0; vertical-align: bottom; }
 td { border-bottom: 1px solid #ddd; padding: 4px 14px 4px 0; vertical-align: top; overflow-wrap: anywhere; }
+td.s { white-space: nowrap; }
 td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
 .row { display: flex; flex-wrap: wrap; gap: 16px; align-items: flex-start; margin: 12px 0; }
 .grid { display: grid; gap: 14px 12px; margin: 12px 0; }
@@ -29,6 +30,9 @@ svg { display: block; max-width: 100%; height: auto; }
 pre { background: #f5f5f5; padding: 12px 16px; overflow-x: auto; font-size: 13px; line-height: 1.4; }
 details summary { cursor: pointer; font-weight: 600; margin: 8px 0; }
 ";
+
+/// Characters of a table's cell that are not broken.
+const SHORT: usize = 16;
 
 /// A page in the making.
 #[derive(Clone, Debug)]
@@ -96,7 +100,10 @@ impl Page {
         for row in rows {
             self.body.push_str("\n<tr>");
             for (column, cell) in row.iter().enumerate() {
-                let _ = write!(self.body, "<td{}>{}</td>", class(column), escape(cell));
+                // Short words stay whole, whatever the width.
+                let short = cell.chars().count() <= SHORT && numeric.get(column) != Some(&true);
+                let class = if short { " class=\"s\"" } else { class(column) };
+                let _ = write!(self.body, "<td{class}>{}</td>", escape(cell));
             }
             self.body.push_str("</tr>");
         }
@@ -166,7 +173,10 @@ mod tests {
         page.advice("do", true);
         let text = page.finish();
         assert_stands_alone(&text);
-        assert!(text.contains("<td class=\"n\">1.5 deg</td>") && text.contains("<td>a&lt;b</td>"), "{text}");
+        assert!(
+            text.contains("<td class=\"n\">1.5 deg</td>") && text.contains("<td class=\"s\">a&lt;b</td>"),
+            "{text}"
+        );
         assert!(text.contains("x<br/>&quot;y&quot;"));
     }
 

@@ -33,11 +33,14 @@ fn stages(network: &Network) -> Vec<Stage> {
             LayerSpec::Conv2d { .. } => Some(BLUE),
             LayerSpec::MaxPool { .. } | LayerSpec::AveragePool { .. } => Some(GREEN),
             LayerSpec::Dense { .. } => Some(ORANGE),
-            LayerSpec::Flatten {} | LayerSpec::Crop { .. } => Some(PALE),
+            LayerSpec::Flatten {} | LayerSpec::Crop { .. } | LayerSpec::ZeroPad { .. } => Some(PALE),
             LayerSpec::BatchNorm { .. }
             | LayerSpec::Relu {}
             | LayerSpec::Elu { .. }
             | LayerSpec::PRelu { .. }
+            | LayerSpec::LeakyRelu { .. }
+            | LayerSpec::Tanh {}
+            | LayerSpec::Softsign {}
             | LayerSpec::Dropout { .. }
             | LayerSpec::Scale { .. } => None,
         };
@@ -83,23 +86,21 @@ pub fn draw(network: &Network, title: &str) -> String {
     svg.text([16.0, 46.0], 13.0, Anchor::Start, &format!("fill=\"{QUIET_INK}\""), &figures);
 
     let column = WIDTH / across as f64;
-    let maps = stages.iter().map(|stage| stage.shape).filter(|shape| shape.positions() > 1);
-    let (side, channels) =
-        maps.fold((1, 1), |(side, channels), shape| (side.max(shape.h).max(shape.w), channels.max(shape.c)));
-    let longest = stages.iter().map(|stage| stage.shape).filter(|s| s.positions() == 1).map(|s| s.c).max().unwrap_or(1);
+    let sizes = Sizes::of(&stages);
     for (i, stage) in stages.iter().enumerate() {
         let (row, place) = (i / across, i % across);
         let top = 60.0 + row_height * row as f64;
         let middle = column * (place as f64 + 0.5);
         let centre = top + BLOCKS / 2.0;
-        let half = block(&mut svg, stage, [middle, centre], side as f64, channels as f64, longest as f64);
-        if i + 1 < stages.len() {
-            let from = middle + half + 3.0;
-            let to = column * (place as f64 + 1.0) + if place + 1 == across { -6.0 } else { 12.0 };
-            arrow(&mut svg, [from.min(to - 10.0), centre], [to, centre]);
+        block(&mut svg, stage, [middle, centre], sizes.block(stage.shape));
+        let half = |stage: &Stage| sizes.block(stage.shape).half_width();
+        if let Some(next) = stages.get(i + 1) {
+            let last = place + 1 == across;
+            let to = if last { WIDTH - 6.0 } else { middle + column - half(next) - 5.0 };
+            arrow(&mut svg, [middle + half(stage) + 5.0, centre], [to, centre]);
         }
         if place == 0 && i > 0 {
-            arrow(&mut svg, [4.0, centre], [18.0, centre]);
+            arrow(&mut svg, [4.0, centre], [middle - half(stage) - 5.0, centre]);
         }
         let mut y = top + BLOCKS + 4.0;
         let mut write = |text: &str, style: &str| {
@@ -116,30 +117,62 @@ pub fn draw(network: &Network, title: &str) -> String {
     svg.finish()
 }
 
-/// Draws the block of a stage around `centre` and returns half of its width. Sides go with the square root of the sizes, so
-/// that small maps stay visible.
-fn block(svg: &mut Svg, stage: &Stage, centre: [f64; 2], side: f64, channels: f64, longest: f64) -> f64 {
-    let edge = format!("stroke=\"{INK}\" stroke-width=\"0.8\" stroke-linejoin=\"round\"");
-    let Shape { c, h, w } = stage.shape;
-    if stage.shape.positions() == 1 {
-        let (width, height) = (14.0, 8.0 + 100.0 * (c as f64 / longest).sqrt());
-        let style = format!("fill=\"{}\" {edge}", stage.colour);
-        svg.rect([centre[0] - width / 2.0, centre[1] - height / 2.0], [width, height], &style);
-        return width / 2.0;
+/// The largest sizes of a network, which blocks are drawn in relation to.
+struct Sizes {
+    side: f64,
+    channels: f64,
+    units: f64,
+}
+
+/// Front and depth of a block; vectors have no depth.
+struct Block {
+    width: f64,
+    height: f64,
+    depth: f64,
+}
+
+impl Sizes {
+    fn of(stages: &[Stage]) -> Sizes {
+        let (maps, vectors): (Vec<Shape>, Vec<Shape>) =
+            stages.iter().map(|stage| stage.shape).partition(|shape| shape.positions() > 1);
+        let largest = |values: &mut dyn Iterator<Item = usize>| values.max().unwrap_or(1) as f64;
+        Sizes {
+            side: largest(&mut maps.iter().map(|shape| shape.h.max(shape.w))),
+            channels: largest(&mut maps.iter().map(|shape| shape.c)),
+            units: largest(&mut vectors.iter().map(|shape| shape.c)),
+        }
     }
-    let scaled = |extent: usize| (LARGEST * (extent as f64 / side).sqrt()).max(4.0);
-    let (width, height) = (scaled(w), scaled(h));
-    let depth = 3.0 + 24.0 * (c as f64 / channels).sqrt();
+
+    /// Sides go with the square root of the sizes, so that small maps stay visible.
+    fn block(&self, shape: Shape) -> Block {
+        if shape.positions() == 1 {
+            return Block { width: 14.0, height: 8.0 + 100.0 * (shape.c as f64 / self.units).sqrt(), depth: 0.0 };
+        }
+        let side = |extent: usize| (LARGEST * (extent as f64 / self.side).sqrt()).max(4.0);
+        let depth = 3.0 + 24.0 * (shape.c as f64 / self.channels).sqrt();
+        Block { width: side(shape.w), height: side(shape.h), depth }
+    }
+}
+
+impl Block {
+    fn half_width(&self) -> f64 {
+        (self.width + self.depth) / 2.0
+    }
+}
+
+/// Draws a stage around `centre`.
+fn block(svg: &mut Svg, stage: &Stage, centre: [f64; 2], Block { width, height, depth }: Block) {
+    let edge = format!("stroke=\"{INK}\" stroke-width=\"0.8\" stroke-linejoin=\"round\"");
+    let light = |opacity: f64| format!("fill=\"{}\" fill-opacity=\"{opacity}\" {edge}", stage.colour);
     let (left, top) = (centre[0] - (width + depth) / 2.0, centre[1] - (height - depth) / 2.0);
     let (right, bottom) = (left + width, top + height);
-    let light = |opacity: f64| format!("fill=\"{}\" fill-opacity=\"{opacity}\" {edge}", stage.colour);
-    svg.polygon(&[[left, top], [left + depth, top - depth], [right + depth, top - depth], [right, top]], &light(0.55));
-    svg.polygon(
-        &[[right, top], [right + depth, top - depth], [right + depth, bottom - depth], [right, bottom]],
-        &light(0.35),
-    );
+    if depth > 0.0 {
+        let lid = [[left, top], [left + depth, top - depth], [right + depth, top - depth], [right, top]];
+        let side = [[right, top], [right + depth, top - depth], [right + depth, bottom - depth], [right, bottom]];
+        svg.polygon(&lid, &light(0.55));
+        svg.polygon(&side, &light(0.35));
+    }
     svg.rect([left, top], [width, height], &light(0.85));
-    (width + depth) / 2.0
 }
 
 fn arrow(svg: &mut Svg, from: [f64; 2], to: [f64; 2]) {

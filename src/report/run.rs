@@ -293,7 +293,7 @@ fn worst(page: &mut Page, answers: &[Answer], data: &Data, full_lock_deg: f64) {
             image.draw_steering(model_deg, picture::MODEL);
             let name = recording.path.file_name().unwrap_or_default().to_string_lossy().into_owned();
             let caption = format!(
-                "{name}, line {}\nhuman {human_deg:+.1}°, predicted {model_deg:+.1}°: off by {:.1}°",
+                "{name}, line {}\nhuman {human_deg:+.1}°, model {model_deg:+.1}°: {:.1}° off",
                 recording.rows[row].line,
                 (model_deg - human_deg).abs()
             );

@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Instant;
 
 use rayon::prelude::*;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::run::{Driver, Expert, INTERVENTION_M, Run, RunOptions, line_errors_m, run};
 use super::speed::Speed;
@@ -50,7 +50,7 @@ pub struct RunPair {
 }
 
 /// The measures of a drive; the fields of `drive --json`.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct DriveSummary {
     /// Track as given on the command line.
     pub track: String,
@@ -240,7 +240,8 @@ pub fn compare(a: &DriveResult, b: &DriveResult) -> Result<Vec<PairedTest>> {
     ])
 }
 
-/// Writes the runs as `free_SEED.csv` and `assisted_SEED.csv` into the folder `out`, which must not exist.
+/// Writes the runs as `free_SEED.csv` and `assisted_SEED.csv`, and their summary as `summary.json`, into the folder `out`, which
+/// must not exist.
 ///
 /// # Errors
 /// If `out` exists or cannot be written.
@@ -253,6 +254,9 @@ pub fn write_trajectories(result: &DriveResult, out: &Path) -> Result<()> {
             written.map_err(|source| folder.explain(Error::Io { path, source }))?;
         }
     }
+    let path = folder.unfinished().join("summary.json");
+    let text = serde_json::to_string_pretty(&result.summary).map_err(|e| Error::data(&path, e.to_string()))?;
+    std::fs::write(&path, text + "\n").map_err(|source| folder.explain(Error::Io { path, source }))?;
     folder.finish()
 }
 

@@ -4,7 +4,7 @@
 use std::io::{self, BufReader};
 use std::net::{Shutdown, TcpStream, ToSocketAddrs};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, TryRecvError, channel};
+use std::sync::mpsc::{Receiver, Sender, channel};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::{JoinHandle, spawn};
 use std::time::{Duration, Instant};
@@ -80,20 +80,13 @@ impl Connection {
     /// What has happened, if something has; to be called in every frame.
     pub fn poll(&self) -> Option<Event> {
         self.link.seen.store(self.link.writer().is_some(), Ordering::Relaxed);
-        match self.events.try_recv() {
-            Ok(event) => Some(event),
-            // The sender lives as long as the socket thread, and that as long as the connection.
-            Err(TryRecvError::Empty | TryRecvError::Disconnected) => None,
-        }
+        self.events.try_recv().ok()
     }
 
     /// Waits at most `limit` for something to happen.
     pub fn wait(&self, limit: Duration) -> Option<Event> {
         self.link.seen.store(self.link.writer().is_some(), Ordering::Relaxed);
-        match self.events.recv_timeout(limit) {
-            Ok(event) => Some(event),
-            Err(RecvTimeoutError::Timeout | RecvTimeoutError::Disconnected) => None,
-        }
+        self.events.recv_timeout(limit).ok()
     }
 
     /// Sends a message. Without a connection, or when it breaks, the message is lost, as it is in the original.
@@ -108,9 +101,10 @@ impl Connection {
 
     /// Ends it as the simulator does when the application quits.
     pub fn quit(self) {
+        // First, so that nobody connects anew when the server closes at the first word.
+        self.link.set_stopped();
         self.link.send("41");
         self.link.send("1");
-        self.link.set_stopped();
         if let Some(writer) = self.link.writer().as_mut() {
             // A server that is gone need not be told.
             let _ = writer.close(None);

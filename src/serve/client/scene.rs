@@ -310,10 +310,13 @@ impl<'a> Scene<'a> {
 
     /// Waits a little for something to happen.
     fn wait(&mut self) -> Result<()> {
-        match self.connection.wait(Duration::from_secs_f64(TICK_S)) {
-            Some(event) => self.take(event),
-            None => self.be_patient(TICK_S)?,
+        let began = Instant::now();
+        let event = self.connection.wait(Duration::from_secs_f64(TICK_S));
+        let waited_s = began.elapsed().as_secs_f64().min(TICK_S);
+        if let Some(event) = event {
+            self.take(event);
         }
+        self.be_patient(waited_s)?;
         if self.observer.progress(self.share) { Ok(()) } else { Err(Error::Interrupted) }
     }
 
