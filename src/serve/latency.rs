@@ -37,7 +37,7 @@ impl Latencies {
 
     /// The longest, ms.
     pub fn longest_ms(&self) -> Option<f64> {
-        (self.total > 0).then(|| self.longest.as_secs_f64() * 1e3)
+        (self.total > 0).then_some(self.longest.as_secs_f64() * 1e3)
     }
 
     /// The duration that the share `quantile` of them does not exceed, ms, rounded up to 10 µs.
