@@ -1,19 +1,23 @@
 //! The kernels at the sizes of the networks, on one core: `cargo bench --bench kernels`.
 //!
 //! Products are reported in elements a second where an element is a floating-point operation, so `Gelem/s` reads as
-//! GFLOP/s; the measured peak is printed first. Passes over memory are reported in bytes read and written.
+//! GFLOP/s, and in percent of the peak that is measured at the start. Passes over memory are reported in bytes read and
+//! written.
 
-use criterion::{Criterion, Throughput, criterion_group, criterion_main};
+use criterion::measurement::WallTime;
+use criterion::{BenchmarkGroup, Criterion, Throughput, criterion_group, criterion_main};
 use std::hint::black_box;
+use std::time::{Duration, Instant};
 use steersman_kernels::conv::{Conv, ConvShape};
 use steersman_kernels::gemm::{gemm, gemm_scratch_len};
+use steersman_kernels::norm_rectify::{self, ChannelMeans, ChannelStatistics, RectifyShape, Slopes};
 use steersman_kernels::pool::PoolShape;
 use steersman_kernels::{Isa, activation, baseline, norm, peak, pool, update};
 
 /// Images in a call: one shard of a training batch.
 const IMAGES: usize = 8;
 
-/// Name, c, h, w, oc, kernel and stride of each convolution of the three networks.
+/// Name, c, h, w, oc, kernel and stride of each convolution of the four networks.
 const LAYERS: &[(&str, [usize; 6])] = &[
     ("hyper1 3x40x160-8", [3, 40, 160, 8, 3, 1]),
     ("hyper2 8x38x158-16", [8, 38, 158, 16, 3, 1]),
@@ -27,11 +31,52 @@ const LAYERS: &[(&str, [usize; 6])] = &[
     ("pilotnet3 36x14x47-48", [36, 14, 47, 48, 5, 2]),
     ("pilotnet4 48x5x22-64", [48, 5, 22, 64, 3, 1]),
     ("pilotnet5 64x3x20-64", [64, 3, 20, 64, 3, 1]),
+    ("default1 3x40x160-16", [3, 40, 160, 16, 5, 2]),
+    ("default2 16x18x78-24", [16, 18, 78, 24, 3, 2]),
+    ("default3 24x8x38-32", [24, 8, 38, 32, 3, 2]),
+    ("default4 32x3x18-48", [32, 3, 18, 48, 3, 1]),
 ];
+
+/// Inputs and outputs of the dense layers; those with fewer than 50 inputs or outputs cost nothing.
+const DENSE: &[(&str, usize, usize)] = &[
+    ("hyper dense1", 1024, 100),
+    ("hyper dense2", 100, 50),
+    ("lenet dense1", 144, 120),
+    ("lenet dense2", 120, 84),
+    ("pilotnet dense1", 1152, 100),
+    ("pilotnet dense2", 100, 50),
+    ("default dense1", 768, 64),
+];
+
+/// Batch norm with what follows it: name, map, pooled, a slope for each position.
+const RECTIFIED: &[(&str, RectifyShape, bool)] = &[
+    ("hyper1", RectifyShape { c: 8, h: 38, w: 158, pooled: false }, false),
+    ("hyper2", RectifyShape { c: 16, h: 36, w: 156, pooled: true }, false),
+    ("hyper3", RectifyShape { c: 24, h: 16, w: 76, pooled: true }, true),
+    ("hyper4", RectifyShape { c: 32, h: 6, w: 36, pooled: true }, true),
+    ("hyper5", RectifyShape { c: 64, h: 1, w: 16, pooled: false }, true),
+    ("default1", RectifyShape { c: 16, h: 18, w: 78, pooled: false }, false),
+    ("default2", RectifyShape { c: 24, h: 8, w: 38, pooled: false }, false),
+    ("default3", RectifyShape { c: 32, h: 3, w: 18, pooled: false }, false),
+];
+
+/// Measures a product of `operations`, and says what share of the `peak` (in GFLOP/s) its best call of 0.1 s reaches.
+fn product(group: &mut BenchmarkGroup<WallTime>, name: &str, operations: u64, peak: f64, mut call: impl FnMut()) {
+    group.throughput(Throughput::Elements(operations));
+    group.bench_function(name, |b| b.iter(&mut call));
+    let (end, mut best) = (Instant::now() + Duration::from_millis(100), f64::INFINITY);
+    while Instant::now() < end {
+        let start = Instant::now();
+        call();
+        best = best.min(start.elapsed().as_secs_f64());
+    }
+    println!("{name}: {:.0} % of the peak", operations as f64 / best / peak / 1e7);
+}
 
 fn convolutions(criterion: &mut Criterion) {
     let isa = Isa::best();
-    println!("{}: peak of one core {:.1} GFLOP/s", isa.name(), peak::measure_peak_gflops(isa, 0.5));
+    let peak = peak::measure_peak_gflops(isa, 0.5);
+    println!("{}: peak of one core {peak:.1} GFLOP/s", isa.name());
     for &(name, [c, h, w, oc, kernel, stride]) in LAYERS {
         let [pad_top, pad_bottom, pad_left, pad_right] = [0; 4];
         let (kh, kw, stride_h, stride_w) = (kernel, kernel, stride, stride);
@@ -43,19 +88,19 @@ fn convolutions(criterion: &mut Criterion) {
         let (mut dx, dy, mut dweight, mut dbias) = (x.clone(), y.clone(), weight.clone(), vec![0.1; oc]);
         let bias = dbias.clone();
         let mut scratch = vec![0.0; conv.scratch_len()];
+        let operations = 2 * IMAGES as u64 * shape.multiply_adds();
         let mut group = criterion.benchmark_group(format!("conv {name}"));
-        group.throughput(Throughput::Elements(2 * IMAGES as u64 * shape.multiply_adds()));
-        group.bench_function("forward", |b| {
-            b.iter(|| conv.forward(IMAGES, black_box(&x), &weight, &bias, &mut y, &mut scratch));
+        product(&mut group, "forward", operations, peak, || {
+            conv.forward(IMAGES, black_box(&x), &weight, &bias, &mut y, &mut scratch);
         });
-        group.bench_function("forward by im2col and matrixmultiply", |b| {
-            b.iter(|| baseline::conv_forward(&shape, IMAGES, black_box(&x), &weight, &bias, &mut y));
+        product(&mut group, "forward by im2col and matrixmultiply", operations, peak, || {
+            baseline::conv_forward(&shape, IMAGES, black_box(&x), &weight, &bias, &mut y);
         });
-        group.bench_function("backward_input", |b| {
-            b.iter(|| conv.backward_input(IMAGES, black_box(&dy), &weight, &mut dx, &mut scratch));
+        product(&mut group, "backward_input", operations, peak, || {
+            conv.backward_input(IMAGES, black_box(&dy), &weight, &mut dx, &mut scratch);
         });
-        group.bench_function("backward_weight", |b| {
-            b.iter(|| conv.backward_weight(IMAGES, black_box(&x), &dy, &mut dweight, &mut dbias, &mut scratch));
+        product(&mut group, "backward_weight", operations, peak, || {
+            conv.backward_weight(IMAGES, black_box(&x), &dy, &mut dweight, &mut dbias, &mut scratch);
         });
         group.finish();
     }
@@ -63,37 +108,106 @@ fn convolutions(criterion: &mut Criterion) {
 
 fn products(criterion: &mut Criterion) {
     let isa = Isa::best();
-    // A dense layer of 1024 inputs and 100 outputs, weight [100][1024]: forward, input gradient, weight gradient.
-    let (inputs, outputs) = (1024, 100);
-    for images in [1, 8, 128] {
-        let sizes = [
-            ("forward", (images, inputs, outputs), (inputs, 1), (1, inputs)),
-            ("backward_input", (images, outputs, inputs), (outputs, 1), (inputs, 1)),
-            ("backward_weight", (outputs, images, inputs), (1, outputs), (inputs, 1)),
-        ];
-        for (name, (m, k, n), a_strides, b_strides) in sizes {
-            let (a, b, mut c) = (vec![0.1; m * k], vec![0.1; k * n], vec![0.0; m * n]);
-            let mut scratch = vec![0.0; gemm_scratch_len(m, k, n)];
-            let mut group = criterion.benchmark_group(format!("dense {images}x{inputs}-{outputs} {name}"));
-            group.throughput(Throughput::Elements(2 * (m * k * n) as u64));
-            group.bench_function("gemm", |bench| {
-                bench.iter(|| {
+    let peak = peak::measure_peak_gflops(isa, 0.5);
+    // A dense layer has a weight of [outputs][inputs]: forward, input gradient, weight gradient.
+    for &(layer, inputs, outputs) in DENSE {
+        for images in [1, 8, 128] {
+            let sizes = [
+                ("forward", (images, inputs, outputs), (inputs, 1), (1, inputs)),
+                ("backward_input", (images, outputs, inputs), (outputs, 1), (inputs, 1)),
+                ("backward_weight", (outputs, images, inputs), (1, outputs), (inputs, 1)),
+            ];
+            for (name, (m, k, n), a_strides, b_strides) in sizes {
+                let (a, b, mut c) = (vec![0.1; m * k], vec![0.1; k * n], vec![0.0; m * n]);
+                let mut scratch = vec![0.0; gemm_scratch_len(m, k, n)];
+                let mut group = criterion.benchmark_group(format!("{layer} {images}x{inputs}-{outputs} {name}"));
+                let operations = 2 * (m * k * n) as u64;
+                product(&mut group, "gemm", operations, peak, || {
                     let (a, c_strides) = (black_box(&a), (n, 1));
                     gemm(isa, m, k, n, 1.0, a, a_strides, &b, b_strides, 0.0, &mut c, c_strides, &mut scratch);
                 });
-            });
-            // The rival: it allocates its packing buffers in every call.
-            group.bench_function("ndarray (matrixmultiply)", |bench| {
+                // The rival: it allocates its packing buffers in every call.
                 let view = |data: &[f32], rows, columns, strides: (usize, usize)| {
                     let shape = ndarray::ShapeBuilder::strides((rows, columns), strides);
                     ndarray::ArrayView2::from_shape(shape, data).map(|view| view.to_owned()).ok()
                 };
-                let (Some(a), Some(b)) = (view(&a, m, k, a_strides), view(&b, k, n, b_strides)) else { return };
-                let mut c = ndarray::Array2::<f32>::zeros((m, n));
-                bench.iter(|| ndarray::linalg::general_mat_mul(1.0, black_box(&a), &b, 0.0, &mut c));
-            });
-            group.finish();
+                if let (Some(a), Some(b)) = (view(&a, m, k, a_strides), view(&b, k, n, b_strides)) {
+                    let mut c = ndarray::Array2::<f32>::zeros((m, n));
+                    product(&mut group, "ndarray (matrixmultiply)", operations, peak, || {
+                        ndarray::linalg::general_mat_mul(1.0, black_box(&a), &b, 0.0, &mut c);
+                    });
+                }
+                group.finish();
+            }
         }
+    }
+}
+
+/// Batch norm, rectifier and pooling in one pass.
+fn rectified(criterion: &mut Criterion) {
+    let isa = Isa::best();
+    for &(name, shape, per_position) in RECTIFIED {
+        let RectifyShape { c, h, w, pooled } = shape;
+        let (image, pooled_image) = (c * h * w, if pooled { c * (h / 2) * (w / 2) } else { c * h * w });
+        let numbers = |len: usize| (0..len).map(|i| (i * 7919 % 1000) as f32 / 500.0 - 1.0).collect::<Vec<f32>>();
+        let (mut x, mut y, dy) =
+            (numbers(IMAGES * image), vec![0.0; IMAGES * pooled_image], numbers(IMAGES * pooled_image));
+        let (of_channel, list, mut sums) = (numbers(c), numbers(image), vec![0.0; 2 * c]);
+        let slopes = if per_position { Slopes::PerPosition(&list) } else { Slopes::Zero };
+        let mut dslopes = vec![0.0; if per_position { image } else { 0 }];
+        let s = &of_channel;
+        let statistics = ChannelStatistics { mean: s, inv_std: s, scale: s, shift: s };
+        let mut group = criterion.benchmark_group(format!("norm_rectify {name} {c}x{h}x{w}"));
+        group.throughput(Throughput::Bytes(4 * (IMAGES * (image + pooled_image)) as u64));
+        group.bench_function("forward", |b| {
+            b.iter(|| norm_rectify::forward(isa, &shape, IMAGES, black_box(&x), s, s, slopes, &mut y));
+        });
+        group.bench_function("backward_sums", |b| {
+            b.iter(|| {
+                let x = black_box(&x);
+                norm_rectify::backward_sums(isa, &shape, IMAGES, x, &dy, statistics, slopes, &mut sums, &mut dslopes);
+            });
+        });
+        group.throughput(Throughput::Bytes(4 * (IMAGES * (2 * image + pooled_image)) as u64));
+        group.bench_function("backward", |b| {
+            // In place: statistics of 0 but for the gain of 1 keep the values from growing.
+            let (zero, one) = (vec![0.0; c], vec![1.0; c]);
+            let means = ChannelMeans { dz: &zero, dz_xhat: &zero, gain: &one };
+            b.iter(|| norm_rectify::backward(isa, &shape, IMAGES, black_box(&mut x), &dy, statistics, means, slopes));
+        });
+        group.finish();
+    }
+}
+
+/// A convolution behind a 4x4 pooling: the pooling with its places, and the gradients from those alone.
+fn pooled_convolutions(criterion: &mut Criterion) {
+    let isa = Isa::best();
+    for &(name, [c, h, w, oc, kernel, _]) in LAYERS.iter().filter(|(name, _)| name.starts_with("lenet")) {
+        let [pad_top, pad_bottom, pad_left, pad_right] = [0; 4];
+        let (kh, kw, stride_h, stride_w) = (kernel, kernel, 1, 1);
+        let shape = ConvShape { c, h, w, oc, kh, kw, stride_h, stride_w, pad_top, pad_bottom, pad_left, pad_right };
+        let pool_shape =
+            PoolShape { c: oc, h: shape.out_h(), w: shape.out_w(), kh: 4, kw: 4, stride_h: 4, stride_w: 4 };
+        let conv = Conv::new(shape, isa);
+        let map: Vec<f32> =
+            (0..IMAGES * oc * shape.out_h() * shape.out_w()).map(|i| (i * 7919 % 1000) as f32).collect();
+        let pooled = IMAGES * oc * pool_shape.out_h() * pool_shape.out_w();
+        let (mut y, mut places, dy) = (vec![0.0; pooled], vec![0; pooled], vec![0.5; pooled]);
+        let (x, weight) = (vec![0.5; IMAGES * c * h * w], vec![0.1; oc * c * kh * kw]);
+        let (mut dx, mut dweight, mut dbias) = (x.clone(), weight.clone(), vec![0.0; oc]);
+        let mut group = criterion.benchmark_group(format!("pooled conv {name}"));
+        group.throughput(Throughput::Bytes(4 * (map.len() + 2 * pooled) as u64));
+        group.bench_function("max_forward_with_places", |b| {
+            b.iter(|| pool::max_forward_with_places(isa, &pool_shape, IMAGES, w, black_box(&map), &mut y, &mut places));
+        });
+        group.throughput(Throughput::Elements(2 * (pooled * c * kh * kw) as u64));
+        group.bench_function("sparse_backward_weight", |b| {
+            b.iter(|| conv.sparse_backward_weight(IMAGES, black_box(&x), &places, &dy, &mut dweight, &mut dbias));
+        });
+        group.bench_function("sparse_backward_input", |b| {
+            b.iter(|| conv.sparse_backward_input(IMAGES, &places, black_box(&dy), &weight, &mut dx));
+        });
+        group.finish();
     }
 }
 
@@ -169,6 +283,6 @@ fn passes(criterion: &mut Criterion) {
 criterion_group! {
     name = benches;
     config = Criterion::default().sample_size(20).measurement_time(std::time::Duration::from_secs(1));
-    targets = convolutions, products, passes
+    targets = convolutions, pooled_convolutions, products, rectified, passes
 }
 criterion_main!(benches);

@@ -10,13 +10,17 @@ use steersman_kernels::Isa;
 const IMAGES: usize = 8;
 
 /// Name, input (channels, height, width), layer.
-const LAYERS: [(&str, [usize; 3], &str); 10] = [
+const LAYERS: [(&str, [usize; 3], &str); 14] = [
     ("hyper conv2", [8, 38, 158], "kind = 'conv2d', filters = 16, kernel = [3, 3]"),
     ("pilotnet conv2", [24, 31, 98], "kind = 'conv2d', filters = 36, kernel = [5, 5], stride = [2, 2]"),
     ("hyper bn2", [16, 36, 156], "kind = 'batch_norm'"),
     ("hyper relu2", [16, 36, 156], "kind = 'relu'"),
     ("hyper prelu1", [24, 16, 76], "kind = 'prelu'"),
     ("pilotnet elu1", [24, 31, 98], "kind = 'elu'"),
+    ("leaky relu", [24, 31, 98], "kind = 'leaky_relu', slope = 0.1"),
+    ("tanh", [24, 31, 98], "kind = 'tanh'"),
+    ("softsign", [24, 31, 98], "kind = 'softsign'"),
+    ("zero pad", [24, 31, 98], "kind = 'zero_pad', rows = [1, 1], columns = [1, 1]"),
     ("hyper pool1", [16, 36, 156], "kind = 'max_pool', window = [2, 2]"),
     ("lenet pool1", [6, 62, 62], "kind = 'max_pool', window = [4, 4]"),
     ("pilotnet dropout", [64, 1, 18], "kind = 'dropout', drop_probability = 0.5"),

@@ -3,11 +3,15 @@
 use std::hint::black_box;
 
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
+use steersman::model_file::{Model, TrainingRecord};
+use steersman::pilot::Pilot;
+use steersman::recipe::Recipe;
 use steersman::simulator::run::run;
 use steersman::simulator::{
-    Camera, DriveState, Driver, Expert, Mount, Renderer, RgbFrame, RunOptions, Simulation, Speed, Start, Track,
-    Variant, jpeg,
+    Camera, DriveState, Driver, Expert, HEIGHT, Mount, Renderer, RgbFrame, RunOptions, Simulation, Speed, Start, Track,
+    Variant, WIDTH, jpeg,
 };
+use steersman_kernels::Isa;
 
 /// Cameras all around a lap, so that every kind of view is in the mean.
 fn cameras(track: &Track) -> Vec<Camera> {
@@ -50,24 +54,40 @@ fn pictures(c: &mut Criterion) {
     group.finish();
 }
 
-/// A driver that is shown every picture and steers like the expert.
-struct Watching;
+/// Looks at every picture, through a network where there is one, and steers like the expert.
+struct Watching(Option<Pilot>);
 
 impl Driver for Watching {
     fn steer(&mut self, frame: &RgbFrame, state: &DriveState) -> f32 {
+        if let Some(pilot) = &mut self.0 {
+            black_box(pilot.steer(HEIGHT, WIDTH, &frame.pixels)).expect("a picture of the right size");
+        }
         black_box(frame);
         Expert.steer(frame, state)
     }
 }
 
-/// Simulated seconds count as elements: elements a second are the real-time factor.
+/// A network with random weights: as fast as a trained one.
+fn untrained(recipe: &str) -> Pilot {
+    let recipe = Recipe::find(recipe, &[]).expect("a built-in recipe");
+    let parameters = recipe.network(Isa::best()).expect("layers that fit").initialize(1);
+    let model = Model { recipe, parameters, record: TrainingRecord::default(), training_rows: Vec::new() };
+    Pilot::new(model, Isa::best()).expect("layers that fit")
+}
+
+/// Simulated seconds count as elements: elements a second are the real-time factor. Each has 20 pictures, drawn, encoded
+/// and decoded.
 fn closed_loop(c: &mut Criterion) {
     let track = Track::load("lake").expect("a built-in track");
     let options = RunOptions { laps: 1, speed: Speed::Fixed(20.0), latency_ms: 0.0, noise: 0.0, assisted: false };
-    let seconds = run(&track, &mut Watching, &options, 1).expect("a run").time_s;
     let mut group = c.benchmark_group("simulator");
-    group.sample_size(10).throughput(Throughput::Elements(seconds as u64));
-    group.bench_function("drive_simulated_seconds", |b| b.iter(|| run(&track, &mut Watching, &options, 1)));
+    for (name, pilot) in [("expert", None), ("lenet", Some(untrained("lenet")))] {
+        let mut driver = Watching(pilot);
+        let seconds = run(&track, &mut driver, &options, 1).expect("a run").time_s;
+        group.sample_size(10).throughput(Throughput::Elements(seconds as u64));
+        let id = BenchmarkId::new("drive_simulated_seconds", name);
+        group.bench_function(id, |b| b.iter(|| run(&track, &mut driver, &options, 1)));
+    }
     group.finish();
 }
 

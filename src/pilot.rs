@@ -9,7 +9,7 @@ use crate::dataset::decode::{MAX_SIDE, RgbImage, decode_rgb_within};
 use crate::dataset::preprocess::Preprocessor;
 use crate::error::{Error, Result};
 use crate::model_file::Model;
-use crate::network::{InferencePlan, Network, Parameters};
+use crate::network::{InferencePlan, Network, ObservationPlan, Parameters};
 use crate::recipe::Recipe;
 use crate::simulator::{DriveState, Driver, HEIGHT, RgbFrame, WIDTH};
 
@@ -32,6 +32,8 @@ use crate::simulator::{DriveState, Driver, HEIGHT, RgbFrame, WIDTH};
 pub struct Pilot {
     model: Arc<Loaded>,
     plan: InferencePlan,
+    /// Planned when somebody first wants to see what the layers make of an image.
+    observation: Option<ObservationPlan>,
     preprocessor: Preprocessor,
     image: RgbImage,
     planes: Vec<u8>,
@@ -65,8 +67,11 @@ impl Pilot {
         let Model { recipe, parameters, .. } = model;
         let network = recipe.network(isa)?;
         let [height, width] = recipe.preprocessing.source;
+        let mut plan = InferencePlan::new(&network, 1);
+        plan.prepare(&network, &parameters);
         Ok(Pilot {
-            plan: InferencePlan::new(&network, 1),
+            plan,
+            observation: None,
             preprocessor: recipe.preprocessing.plan(height, width)?,
             image: RgbImage::default(),
             planes: vec![0; recipe.preprocessing.output_len()],
@@ -80,12 +85,50 @@ impl Pilot {
         &self.model.recipe
     }
 
+    /// The network that steers.
+    pub fn network(&self) -> &Network {
+        &self.model.network
+    }
+
+    /// The numbers of the network.
+    pub fn parameters(&self) -> &Parameters {
+        &self.model.parameters
+    }
+
     /// Steering for an RGB image, `[height][width][3]`. Roughly in [−1, 1], positive to the right; not clamped.
     ///
     /// # Errors
     ///
     /// [`Error::Usage`] if the image has no pixels, or not as many as it says.
     pub fn steer(&mut self, height: usize, width: usize, rgb: &[u8]) -> Result<f32> {
+        self.look_at(height, width, rgb)?;
+        let mut steering = [0.0];
+        self.plan.run_prepared(&self.model.network, &self.model.parameters, &self.input, &mut steering);
+        Ok(steering[0])
+    }
+
+    /// As [`steer`](Self::steer), telling `seen` the place of each layer that computes something, and its output.
+    ///
+    /// # Errors
+    ///
+    /// As [`steer`](Self::steer).
+    pub fn steer_observed(
+        &mut self,
+        height: usize,
+        width: usize,
+        rgb: &[u8],
+        seen: &mut dyn FnMut(usize, &[f32]),
+    ) -> Result<f32> {
+        self.look_at(height, width, rgb)?;
+        let Loaded { network, parameters, .. } = &*self.model;
+        let mut steering = [0.0];
+        let plan = self.observation.get_or_insert_with(|| ObservationPlan::new(network));
+        plan.run(network, parameters, &self.input, &mut steering, seen);
+        Ok(steering[0])
+    }
+
+    /// Makes the network's input of an RGB image.
+    fn look_at(&mut self, height: usize, width: usize, rgb: &[u8]) -> Result<()> {
         if rgb.len() != height * width * 3 {
             return Err(Error::Usage(format!("{} bytes are no RGB image of {width}x{height} pixels", rgb.len())));
         }
@@ -94,9 +137,7 @@ impl Pilot {
         }
         self.preprocessor.apply(rgb, &mut self.planes);
         self.model.recipe.preprocessing.to_input(&self.planes, &mut self.input);
-        let mut steering = [0.0];
-        self.plan.run(&self.model.network, &self.model.parameters, &self.input, &mut steering);
-        Ok(steering[0])
+        Ok(())
     }
 
     /// Steering for a JPEG or PNG image.

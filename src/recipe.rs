@@ -31,6 +31,9 @@ pub const SHIPPED: [(&str, &str); 5] = [
     ("pilotnet", include_str!("../data/recipes/pilotnet.toml")),
 ];
 
+/// Longer networks are refused.
+const MAX_LAYERS: usize = 1000;
+
 /// A whole experiment.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -56,6 +59,9 @@ pub struct Recipe {
     /// When to stop before the last epoch; never when absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub early_stopping: Option<EarlyStopping>,
+    /// Which epoch's weights become the model.
+    #[serde(default)]
+    pub keep: Keep,
     /// The network, from input to output.
     pub layers: Vec<LayerSpec>,
     /// From camera image to network input.
@@ -88,6 +94,18 @@ pub struct EarlyStopping {
     /// A smaller fall of the validation loss is no improvement.
     #[serde(default)]
     pub min_delta: f64,
+}
+
+/// Which epoch's weights become the model of a run.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Keep {
+    /// The epoch with the lowest validation loss.
+    #[default]
+    Best,
+    /// The last one. Where the learning rate falls to nothing the last epoch is the end of the descent, and differences
+    /// between the validation losses of the last few are chance.
+    Last,
 }
 
 fn default_full_lock_deg() -> f64 {
@@ -179,6 +197,9 @@ impl Recipe {
         if self.name.is_empty() || self.name.starts_with('.') || !self.name.chars().all(allowed) {
             return Err(format!("name must consist of letters, digits, - and _, not be `{}`", self.name));
         }
+        if self.layers.len() > MAX_LAYERS {
+            return Err(format!("layers: {} are more than {MAX_LAYERS}", self.layers.len()));
+        }
         if self.epochs == 0 || self.batch == 0 {
             return Err("epochs and batch must be at least 1".into());
         }
@@ -186,6 +207,9 @@ impl Recipe {
             && !(min_delta.is_finite() && min_delta >= 0.0)
         {
             return Err(format!("early_stopping.min_delta must not be negative or infinite, but is {min_delta}"));
+        }
+        if self.keep == Keep::Last && self.early_stopping.is_some() {
+            return Err("early_stopping keeps the best epoch, so it does not go with keep = \"last\"".into());
         }
         let plateau = matches!(self.schedule.shape, Schedule::ReduceOnPlateau { .. });
         if self.split.validation_share == 0.0 && (plateau || self.early_stopping.is_some()) {
@@ -332,9 +356,12 @@ mod tests {
         assert!(error(&["optimizer.learning_rate=-1"]).contains("learning_rate must be a positive number"));
         assert!(error(&["preprocessing.rows=[10, 200]"]).contains("rows"));
         assert!(error(&["preprocessing.resize=[4, 4]"]).contains("layer `pool1`"));
+        assert!(error(&["keep=last", "early_stopping={patience_epochs=1}"]).contains("keeps the best epoch"));
         assert!(error(&["name='../x'"]).contains("letters, digits"));
         assert!(error(&["early_stopping={patience_epochs=1}", "split.validation_share=0"]).contains("validation side"));
         assert!(error(&["layers=[{kind='dense', units=100000000000000}]"]).contains("units"));
+        let many = format!("layers=[{}]", "{kind='relu'},".repeat(1001));
+        assert!(error(&[&many]).contains("1001 are more than 1000"));
         assert!(error(&["layers=[{kind='conv2d', filters=60000, kernel=[3, 3]}]"]).contains("more than"));
     }
 }

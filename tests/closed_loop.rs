@@ -17,7 +17,7 @@ struct Silent;
 
 impl Observer for Silent {
     fn notice(&mut self, _: &str) {}
-    fn progress(&mut self, _: u32, _: usize, _: usize) {}
+    fn progress(&mut self, _: u32, _: usize, _: usize, _: f64) {}
     fn epoch(&mut self, _: &EpochRecord, _: u32) {}
 }
 

@@ -5,8 +5,11 @@
 //! | ReLU | `max(x, 0)` | `dy` where `y > 0`, else 0 |
 //! | ELU (Clevert et al. 2015) | `x` if `x > 0`, else `alpha (e^x - 1)` | `dy` where `y > 0`, else `dy (y + alpha)` |
 //! | PReLU (He et al. 2015) | `x` if `x > 0`, else `slope x` | `dy` where `x > 0`, else `slope dy` |
+//! | leaky ReLU (Maas et al. 2013) | as PReLU, with one fixed slope | as PReLU |
+//! | tanh | `tanh x` | `dy (1 - y^2)` |
+//! | softsign | `x / (1 + \|x\|)` | `dy (1 - \|y\|)^2` |
 //!
-//! ReLU and ELU need only their output `y` to go backward, PReLU its input `x`.
+//! ReLU, ELU, tanh and softsign need only their output `y` to go backward, PReLU and leaky ReLU their input `x`.
 
 /// `e^x - 1` for `x <= 0`, relative error below 1e-6; the same operations in the same order in every lane.
 ///
@@ -68,6 +71,70 @@ per_isa! {
         assert!(y.len() == dy.len() && y.len() == dx.len(), "elu_backward: y, dy and dx differ in length");
         for ((dx, &dy), &y) in dx.iter_mut().zip(dy).zip(y) {
             *dx = if y > 0.0 { dy } else { dy * (y + alpha) };
+        }
+    }
+}
+
+per_isa! {
+    /// `y = x` where `x > 0`, else `slope x`.
+    pub fn leaky_relu_forward<S>(_simd: S, slope: f32, x: &[f32], y: &mut [f32]) {
+        assert_eq!(x.len(), y.len(), "leaky_relu_forward: x and y differ in length");
+        for (y, &x) in y.iter_mut().zip(x) {
+            *y = if x > 0.0 { x } else { slope * x };
+        }
+    }
+}
+
+per_isa! {
+    /// The gradient of [`leaky_relu_forward`] from its input `x`; `dx` is overwritten.
+    pub fn leaky_relu_backward<S>(_simd: S, slope: f32, x: &[f32], dy: &[f32], dx: &mut [f32]) {
+        assert!(x.len() == dy.len() && x.len() == dx.len(), "leaky_relu_backward: x, dy and dx differ in length");
+        for ((dx, &dy), &x) in dx.iter_mut().zip(dy).zip(x) {
+            *dx = if x > 0.0 { dy } else { slope * dy };
+        }
+    }
+}
+
+per_isa! {
+    /// `y = tanh x`, relative error below 2e-6: with `t = e^(-2|x|) - 1`, `tanh |x| = -t / (t + 2)`.
+    pub fn tanh_forward<S>(_simd: S, x: &[f32], y: &mut [f32]) {
+        assert_eq!(x.len(), y.len(), "tanh_forward: x and y differ in length");
+        for (y, &x) in y.iter_mut().zip(x) {
+            let t = expm1_of_negative(-2.0 * x.abs());
+            let value = (-t / (t + 2.0)).copysign(x);
+            // The exponential clamps its argument and loses a NaN with it.
+            *y = if x.is_nan() { x } else { value };
+        }
+    }
+}
+
+per_isa! {
+    /// The gradient of [`tanh_forward`] from its output `y`; `dx` is overwritten.
+    pub fn tanh_backward<S>(_simd: S, y: &[f32], dy: &[f32], dx: &mut [f32]) {
+        assert!(y.len() == dy.len() && y.len() == dx.len(), "tanh_backward: y, dy and dx differ in length");
+        for ((dx, &dy), &y) in dx.iter_mut().zip(dy).zip(y) {
+            *dx = dy * (1.0 - y * y);
+        }
+    }
+}
+
+per_isa! {
+    /// `y = x / (1 + |x|)`.
+    pub fn softsign_forward<S>(_simd: S, x: &[f32], y: &mut [f32]) {
+        assert_eq!(x.len(), y.len(), "softsign_forward: x and y differ in length");
+        for (y, &x) in y.iter_mut().zip(x) {
+            *y = x / (1.0 + x.abs());
+        }
+    }
+}
+
+per_isa! {
+    /// The gradient of [`softsign_forward`] from its output `y`, as `1 - |y| = 1 / (1 + |x|)`; `dx` is overwritten.
+    pub fn softsign_backward<S>(_simd: S, y: &[f32], dy: &[f32], dx: &mut [f32]) {
+        assert!(y.len() == dy.len() && y.len() == dx.len(), "softsign_backward: y, dy and dx differ in length");
+        for ((dx, &dy), &y) in dx.iter_mut().zip(dy).zip(y) {
+            let rest = 1.0 - y.abs();
+            *dx = dy * (rest * rest);
         }
     }
 }
@@ -169,6 +236,24 @@ mod tests {
                 let truth = f64::from(x).exp_m1();
                 assert!(((f64::from(y) - truth) / truth).abs() <= 1e-6, "{}: expm1({x:e}) = {y:e}", isa.name());
             }
+        }
+    }
+
+    #[test]
+    fn tanh_is_within_2e_6_of_the_truth_and_odd() {
+        for isa in Isa::available() {
+            let x: Vec<f32> = (0..400_000).map(|i| 1.00012f32.powi(i - 250_000).min(120.0)).collect();
+            let (mut y, mut negative) = (vec![f32::NAN; x.len()], vec![f32::NAN; x.len()]);
+            tanh_forward(isa, &x, &mut y);
+            tanh_forward(isa, &x.iter().map(|x| -x).collect::<Vec<_>>(), &mut negative);
+            for ((&x, &y), &negative) in x.iter().zip(&y).zip(&negative) {
+                let truth = f64::from(x).tanh();
+                assert!(((f64::from(y) - truth) / truth).abs() <= 2e-6, "{}: tanh({x:e}) = {y:e}", isa.name());
+                assert_eq!(negative, -y);
+            }
+            let mut y = [1.0; 4];
+            tanh_forward(isa, &[f32::NAN, 0.0, f32::NEG_INFINITY, f32::INFINITY], &mut y);
+            assert!(y[0].is_nan() && y[1] == 0.0 && y[2] == -1.0 && y[3] == 1.0, "{y:?}");
         }
     }
 

@@ -5,16 +5,20 @@
 //! | forward | a sum over taps with vectors along the output rows (`direct`), of the image itself when the stride is 1 and nothing is padded, else of a copy that is padded and split into phases (`prepare`) |
 //! | input gradient | for each phase of the input the same sum over the zero-padded output gradient, with the kernel turned round (`input_gradient`); where that would mostly multiply zeros, a matrix product and [`crate::im2col::col2im`] |
 //! | weight gradient | vectors along the output rows, summed over lanes at the end (`weight_gradient`) |
+//! | both gradients, behind 4x4 pooling | one position at a time (`sparse`) |
+//!
+//! Within a pass the sizes of tiles and blocks follow from the shape and the instruction set: see `direct`.
 
 mod direct;
 mod grid;
 mod input_gradient;
 mod prepare;
 mod shape;
+mod sparse;
 mod weight_gradient;
 
 use crate::Isa;
-use direct::TapSum;
+use direct::{Band, TapSum};
 use input_gradient::InputGradient;
 use prepare::Layout;
 pub use shape::ConvShape;
@@ -53,11 +57,14 @@ impl Conv {
             "convolution: every size but the padding must be at least 1 in {shape:?}"
         );
         let layout = Layout::new(shape);
+        let spans = grid::spans(shape.out_h(), shape.out_w(), layout.pitch, isa.lanes());
+        let bands = if spans.is_empty() { vec![] } else { vec![Band { spans: 0..spans.len(), taps: 0..shape.taps() }] };
         let sum = TapSum {
             taps: layout.taps(),
             weights: (0..shape.taps()).collect(),
             weight_stride: shape.taps(),
-            spans: grid::spans(shape.out_h(), shape.out_w(), layout.pitch, isa.lanes()),
+            spans,
+            bands,
             origin: 0,
             in_image: layout.image(),
             channels: shape.oc,
@@ -109,10 +116,45 @@ impl Conv {
     /// # Panics
     /// If a slice has another length, or `scratch` less than [`Conv::scratch_len`].
     pub fn forward(&self, n: usize, x: &[f32], weight: &[f32], bias: &[f32], y: &mut [f32], scratch: &mut [f32]) {
-        let any = self.check("conv forward", n, x.len(), y.len(), weight.len(), scratch.len());
-        assert_eq!(bias.len(), self.shape.oc, "conv forward: length of the bias of {:?}", self.shape);
-        if any {
-            forward(self.isa, self, x, weight, bias, y, scratch);
+        assert!(scratch.len() >= self.scratch_len(), "conv forward: scratch must have {} elements", self.scratch_len());
+        let (packed, scratch) = scratch.split_at_mut(self.packed_len());
+        self.pack(weight, bias, packed);
+        self.run_packed(n, x, packed, y, scratch);
+    }
+
+    /// Elements that the weights and bias of [`Conv::pack`] take.
+    pub fn packed_len(&self) -> usize {
+        self.sum.packed_len()
+    }
+
+    /// Puts weights and bias in the order in which [`Conv::forward_packed`] reads them.
+    ///
+    /// # Panics
+    /// If a slice has another length; that of `packed` is [`Conv::packed_len`].
+    pub fn pack(&self, weight: &[f32], bias: &[f32], packed: &mut [f32]) {
+        let shape = &self.shape;
+        assert_eq!(weight.len(), shape.oc * shape.taps(), "conv pack: length of the weights of {shape:?}");
+        assert_eq!(bias.len(), shape.oc, "conv pack: length of the bias of {shape:?}");
+        assert_eq!(packed.len(), self.packed_len(), "conv pack: length of the packed weights of {shape:?}");
+        pack(self.isa, self, weight, bias, packed);
+    }
+
+    /// As [`Conv::forward`], with weights and bias from [`Conv::pack`].
+    ///
+    /// # Panics
+    /// As [`Conv::forward`].
+    pub fn forward_packed(&self, n: usize, x: &[f32], packed: &[f32], y: &mut [f32], scratch: &mut [f32]) {
+        assert!(scratch.len() >= self.scratch_len(), "conv forward: scratch must have {} elements", self.scratch_len());
+        assert_eq!(packed.len(), self.packed_len(), "conv forward: length of the packed weights of {:?}", self.shape);
+        self.run_packed(n, x, packed, y, scratch);
+    }
+
+    fn run_packed(&self, n: usize, x: &[f32], packed: &[f32], y: &mut [f32], scratch: &mut [f32]) {
+        let shape = &self.shape;
+        assert_eq!(x.len(), n * shape.x_len(), "conv forward: length of the {n} inputs of {shape:?}");
+        assert_eq!(y.len(), n * shape.y_len(), "conv forward: length of the {n} outputs of {shape:?}");
+        if !y.is_empty() {
+            forward(self.isa, self, x, packed, y, scratch);
         }
     }
 
@@ -155,19 +197,62 @@ impl Conv {
     }
 }
 
-per_isa! {
-    fn forward<S>(
-        simd: S,
-        conv: &Conv,
+/// Gradients from `count` positions of each output channel, all others being 0.
+///
+/// `starts` tells the positions, `[n][oc][count]`: where the window of the output begins in a plane of the input,
+/// `oy * w + ox`. `dy` are the output gradients there.
+impl Conv {
+    /// Whether the shape has these: strides of 1, no padding, 3x3 or 5x5 kernels.
+    pub fn has_sparse_gradients(&self) -> bool {
+        sparse::supports(&self.shape)
+    }
+
+    /// As [`Conv::backward_weight`].
+    ///
+    /// # Panics
+    /// If a slice has another length, a start lies outside the plane, or the shape has no sparse gradients.
+    pub fn sparse_backward_weight(
+        &self,
+        n: usize,
         x: &[f32],
-        weight: &[f32],
-        bias: &[f32],
-        y: &mut [f32],
-        scratch: &mut [f32],
+        starts: &[u32],
+        dy: &[f32],
+        dweight: &mut [f32],
+        dbias: &mut [f32],
     ) {
-        let (copy, packed) = scratch.split_at_mut(conv.copy_len(FORWARD_COPIES));
+        self.check_sparse(n, x.len(), starts.len(), dy.len(), dweight.len());
+        assert_eq!(dbias.len(), self.shape.oc, "sparse conv gradient: length of the bias of {:?}", self.shape);
+        sparse::weight_gradient(self.isa, &self.shape, x, starts, dy, dweight, dbias);
+    }
+
+    /// As [`Conv::backward_input`].
+    ///
+    /// # Panics
+    /// As [`Conv::sparse_backward_weight`].
+    pub fn sparse_backward_input(&self, n: usize, starts: &[u32], dy: &[f32], weight: &[f32], dx: &mut [f32]) {
+        self.check_sparse(n, dx.len(), starts.len(), dy.len(), weight.len());
+        sparse::input_gradient(self.isa, &self.shape, starts, dy, weight, dx);
+    }
+
+    fn check_sparse(&self, n: usize, x_len: usize, starts: usize, dy: usize, weight: usize) {
+        let shape = &self.shape;
+        assert!(self.has_sparse_gradients(), "no sparse gradients of {shape:?}");
+        assert_eq!(x_len, n * shape.x_len(), "sparse conv gradient: length of the {n} inputs of {shape:?}");
+        assert_eq!(weight, shape.oc * shape.taps(), "sparse conv gradient: length of the weights of {shape:?}");
+        assert!(starts == dy && dy.is_multiple_of((n * shape.oc).max(1)), "sparse conv gradient: uneven positions");
+    }
+}
+
+per_isa! {
+    fn pack<S>(simd: S, conv: &Conv, weight: &[f32], bias: &[f32], packed: &mut [f32]) {
+        conv.sum.pack(simd, Some(bias), weight, packed);
+    }
+}
+
+per_isa! {
+    fn forward<S>(simd: S, conv: &Conv, x: &[f32], packed: &[f32], y: &mut [f32], scratch: &mut [f32]) {
+        let copy = &mut scratch[..conv.copy_len(FORWARD_COPIES)];
         let sum = &conv.sum;
-        sum.pack(simd, Some(bias), weight, packed);
         if !conv.layout.copies {
             return sum.run(simd, x, packed, y);
         }

@@ -28,6 +28,7 @@ pub mod conv;
 pub mod gemm;
 pub mod im2col;
 pub mod norm;
+pub mod norm_rectify;
 pub mod peak;
 pub mod pixels;
 pub mod pool;

@@ -170,6 +170,48 @@ pub fn elu_backward(alpha: f32, y: &[f32], dy: &[f32], dx: &mut [f32]) {
     }
 }
 
+/// See [`crate::activation::leaky_relu_forward`].
+pub fn leaky_relu_forward(slope: f32, x: &[f32], y: &mut [f32]) {
+    for i in 0..x.len() {
+        y[i] = if x[i] > 0.0 { x[i] } else { slope * x[i] };
+    }
+}
+
+/// See [`crate::activation::leaky_relu_backward`].
+pub fn leaky_relu_backward(slope: f32, x: &[f32], dy: &[f32], dx: &mut [f32]) {
+    for i in 0..x.len() {
+        dx[i] = if x[i] > 0.0 { dy[i] } else { slope * dy[i] };
+    }
+}
+
+/// See [`crate::activation::tanh_forward`].
+pub fn tanh_forward(x: &[f32], y: &mut [f32]) {
+    for i in 0..x.len() {
+        y[i] = f64::from(x[i]).tanh() as f32;
+    }
+}
+
+/// See [`crate::activation::tanh_backward`].
+pub fn tanh_backward(y: &[f32], dy: &[f32], dx: &mut [f32]) {
+    for i in 0..y.len() {
+        dx[i] = (f64::from(dy[i]) * (1.0 - f64::from(y[i]).powi(2))) as f32;
+    }
+}
+
+/// See [`crate::activation::softsign_forward`].
+pub fn softsign_forward(x: &[f32], y: &mut [f32]) {
+    for i in 0..x.len() {
+        y[i] = (f64::from(x[i]) / (1.0 + f64::from(x[i]).abs())) as f32;
+    }
+}
+
+/// See [`crate::activation::softsign_backward`].
+pub fn softsign_backward(y: &[f32], dy: &[f32], dx: &mut [f32]) {
+    for i in 0..y.len() {
+        dx[i] = (f64::from(dy[i]) * (1.0 - f64::from(y[i]).abs()).powi(2)) as f32;
+    }
+}
+
 /// See [`crate::activation::prelu_forward`].
 pub fn prelu_forward(slopes: &[f32], repeat: usize, x: &[f32], y: &mut [f32]) {
     for i in 0..x.len() {

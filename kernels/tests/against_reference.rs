@@ -4,6 +4,8 @@
 mod convolutions;
 #[path = "against_reference/elementwise.rs"]
 mod elementwise;
+#[path = "against_reference/fused.rs"]
+mod fused;
 #[path = "against_reference/products.rs"]
 mod products;
 

@@ -3,6 +3,7 @@
 use std::time::Instant;
 
 use clap::Args;
+use rayon::prelude::*;
 use serde::Serialize;
 use steersman_kernels::Isa;
 use steersman_kernels::peak::measure_peak_gflops;
@@ -90,15 +91,14 @@ pub fn run(args: BenchArgs, started: Instant) -> Result<()> {
 fn measure(recipe: &Recipe, args: &BenchArgs, started: Instant) -> Result<BenchResult> {
     let network = recipe.network(Isa::best())?;
     let mut parameters = network.initialize(1);
-    let mut random = rng(1, Purpose::Test, 0, 0);
-    let mut fill = |len: usize| (0..len).map(|_| uniform(&mut random, -0.5, 0.5) as f32).collect::<Vec<f32>>();
-    let x: Vec<Vec<f32>> = (0..BATCHES).map(|_| fill(args.batch * network.input().len())).collect();
-    let labels: Vec<Vec<f32>> = (0..BATCHES).map(|_| fill(args.batch)).collect();
+    // The first step waits for its own batch alone, as in training.
+    let mut x = vec![random_numbers(args.batch * network.input().len(), 0)];
+    let labels: Vec<Vec<f32>> = (0..BATCHES).map(|batch| random_numbers(args.batch, 1 << 32 | batch as u64)).collect();
 
     let mut plan = TrainingPlan::new(&network, args.batch);
     let mut optimizer = Optimizer::new(recipe.optimizer, recipe.clip_gradient_norm, &network);
     let mut step = 0;
-    let mut train_step = |parameters: &mut Parameters| {
+    let mut train_step = |x: &[Vec<f32>], parameters: &mut Parameters| {
         let batch = step % BATCHES;
         let input = StepInput { x: &x[batch], labels: &labels[batch], seed: 1, step: step as u64 };
         plan.step(&network, parameters, &recipe.loss, input);
@@ -106,12 +106,13 @@ fn measure(recipe: &Recipe, args: &BenchArgs, started: Instant) -> Result<BenchR
         optimizer.step(recipe.optimizer.learning_rate(), &mut parameters.values, plan.gradient_mut(), norm);
         step += 1;
     };
-    train_step(&mut parameters);
+    train_step(&x, &mut parameters);
     let first_step_s = started.elapsed().as_secs_f64();
+    x.extend((1..BATCHES).map(|batch| random_numbers(args.batch * network.input().len(), batch as u64)));
 
     let (mut steps, training) = (0, Instant::now());
     while training.elapsed().as_secs_f64() < args.seconds {
-        train_step(&mut parameters);
+        train_step(&x, &mut parameters);
         steps += 1;
     }
     let train_images_per_second = (steps * args.batch) as f64 / training.elapsed().as_secs_f64();
@@ -133,6 +134,18 @@ fn measure(recipe: &Recipe, args: &BenchArgs, started: Instant) -> Result<BenchR
     })
 }
 
+/// Numbers in [-0.5, 0.5), drawn on all threads.
+fn random_numbers(len: usize, stream: u64) -> Vec<f32> {
+    /// Numbers of one stream.
+    const PART: usize = 1 << 16;
+    let mut numbers = vec![0.0; len];
+    numbers.par_chunks_mut(PART).enumerate().for_each(|(part, numbers)| {
+        let mut random = rng(1, Purpose::Test, part as u64, stream);
+        numbers.fill_with(|| uniform(&mut random, -0.5, 0.5) as f32);
+    });
+    numbers
+}
+
 fn infer_throughput(network: &Network, parameters: &Parameters, x: &[Vec<f32>], args: &BenchArgs) -> f64 {
     let mut plan = InferencePlan::new(network, args.batch);
     let mut y = vec![0.0; args.batch];
@@ -148,11 +161,12 @@ fn infer_throughput(network: &Network, parameters: &Parameters, x: &[Vec<f32>], 
 /// Median and 99th percentile of the time for one image, in microseconds.
 fn infer_latency(network: &Network, parameters: &Parameters, x: &[f32], seconds: f64) -> (f64, f64) {
     let mut plan = InferencePlan::new(network, 1);
+    plan.prepare(network, parameters);
     let mut times = Vec::new();
     let started = Instant::now();
     for image in x.chunks_exact(network.input().len()).cycle() {
         let before = Instant::now();
-        plan.run(network, parameters, image, &mut [0.0]);
+        plan.run_prepared(network, parameters, image, &mut [0.0]);
         times.push(before.elapsed().as_secs_f64() * 1e6);
         if started.elapsed().as_secs_f64() >= seconds {
             break;

@@ -64,6 +64,7 @@ pub fn run(args: EvaluateArgs) -> Result<()> {
     println!("MSE                        {:.5}", metrics.mse);
     println!("MSE / predicting zero      {}", or_dash(metrics.relative_to_zero, 3));
     println!("R2                         {}", or_dash(metrics.r2, 3));
+    println!("correlation                {}", or_dash(metrics.correlation, 3));
     println!("MAE                        {:.2} deg", metrics.mae_deg);
     println!("RMSE                       {:.2} deg", metrics.rmse_deg);
     println!(

@@ -4,29 +4,56 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use super::{print, print_json};
-use crate::dataset::inspect::report;
+use super::share_bar::ShareBar;
+use super::{RecipeArgs, new_folder, pool, print, print_json, refuse_existing};
+use crate::atomic_file;
+use crate::dataset::inspect::inspect;
 use crate::error::Result;
+use crate::report::inspection;
 
-/// Say what is in a recording: rows, sessions, labels, and what cannot be used
+/// Say what is in a recording: rows, sessions, labels, pictures, what cannot be used, and what to do about it
 #[derive(Debug, Args)]
 pub struct InspectArgs {
     /// Udacity logs (a folder or a CSV file) or donkeycar tubs
     #[arg(required = true, value_name = "RECORDING")]
     recordings: Vec<PathBuf>,
+    /// Write a page with pictures, report.html, into this folder, which must not exist
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    #[command(flatten)]
+    recipe: RecipeArgs,
+    /// Seed of the split that the page shows
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Threads; 0 is one for each core
+    #[arg(long, default_value_t = 0)]
+    threads: usize,
     /// Print one JSON array as the last line, one object a recording
     #[arg(long)]
     json: bool,
 }
 
 pub fn run(args: InspectArgs) -> Result<()> {
-    let mut reports = Vec::new();
+    let recipe = args.recipe.find()?;
+    args.out.as_deref().map_or(Ok(()), refuse_existing)?;
+    let pool = pool(args.threads)?;
+    let mut inspections = Vec::new();
     for path in &args.recordings {
-        let report = report(path)?;
+        let bar = ShareBar::new(format!("looking at {}", path.display()));
+        let inspection = pool.install(|| inspect(path, &|share| bar.set(share)))?;
+        drop(bar);
         if !args.json {
-            print(&format!("{report}\n"))?;
+            print(&format!("{}\n", inspection.report))?;
         }
-        reports.push(report);
+        inspections.push(inspection);
+    }
+    let reports: Vec<_> = inspections.iter().map(|inspection| inspection.report.clone()).collect();
+    if let Some(out) = &args.out {
+        let page = inspection::page(inspections, &recipe, args.seed);
+        new_folder(out)?;
+        let path = out.join("report.html");
+        atomic_file::write(&path, page.as_bytes())?;
+        eprintln!("wrote {}", path.display());
     }
     if args.json { print_json(&reports) } else { Ok(()) }
 }

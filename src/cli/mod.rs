@@ -4,8 +4,12 @@
 //! JSON value. Exit codes: 0 done, 1 error, 2 wrong arguments, 130 interrupted.
 
 mod bench;
+mod compare;
 mod drive;
 mod evaluate;
+mod experiment;
+mod explain;
+mod import;
 mod inspect;
 mod predict;
 mod progress;
@@ -14,9 +18,11 @@ mod serve;
 mod share_bar;
 mod sim;
 mod summary;
+mod tracks;
 mod train;
 
 use std::io::{ErrorKind, Write};
+use std::path::Path;
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -44,10 +50,15 @@ enum Command {
     Serve(serve::ServeArgs),
     Sim(sim::SimArgs),
     Evaluate(evaluate::EvaluateArgs),
+    Experiment(experiment::ExperimentArgs),
     Predict(predict::PredictArgs),
     Inspect(inspect::InspectArgs),
+    Tracks(tracks::TracksArgs),
+    Explain(explain::ExplainArgs),
+    Compare(compare::CompareArgs),
     Summary(summary::SummaryArgs),
     Bench(bench::BenchArgs),
+    Import(import::ImportArgs),
 }
 
 /// Runs the command line of this process.
@@ -60,10 +71,15 @@ pub fn main() -> ExitCode {
         Command::Serve(args) => serve::run(args),
         Command::Sim(args) => sim::run(args),
         Command::Evaluate(args) => evaluate::run(args),
+        Command::Experiment(args) => experiment::run(args),
         Command::Predict(args) => predict::run(args),
         Command::Inspect(args) => inspect::run(args),
+        Command::Tracks(args) => tracks::run(args),
+        Command::Explain(args) => explain::run(args),
+        Command::Compare(args) => compare::run(args),
         Command::Summary(args) => summary::run(args),
         Command::Bench(args) => bench::run(args, started),
+        Command::Import(args) => import::run(args),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,
@@ -109,6 +125,20 @@ fn stop_on_ctrl_c() -> Result<Arc<AtomicBool>> {
     };
     ctrlc::set_handler(handler).map_err(|e| Error::Usage(format!("cannot listen for Ctrl-C: {e}")))?;
     Ok(stop)
+}
+
+/// Refuses an output that exists already.
+fn refuse_existing(path: &Path) -> Result<()> {
+    match path.exists() {
+        true => Err(Error::Usage(format!("{}: exists already and is not overwritten; name a new one", path.display()))),
+        false => Ok(()),
+    }
+}
+
+/// Makes the new folder `path`, and those it lies in.
+fn new_folder(path: &Path) -> Result<()> {
+    refuse_existing(path)?;
+    std::fs::create_dir_all(path).map_err(Error::io(path))
 }
 
 /// Prints `text`. Whoever reads may stop before the end, as `head` does.

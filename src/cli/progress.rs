@@ -1,4 +1,4 @@
-//! How a run shows itself: a bar on a terminal, plain lines elsewhere.
+//! How a run shows itself: a bar and live curves on a terminal, plain lines elsewhere.
 
 use std::io::IsTerminal;
 use std::time::{Duration, Instant};
@@ -6,10 +6,15 @@ use std::time::{Duration, Instant};
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::or_dash;
+use crate::report::sparkline::sparkline;
 use crate::training::{EpochRecord, Observer};
 
 /// Time between plain progress lines.
 const PLAIN_INTERVAL: Duration = Duration::from_secs(10);
+/// Time between two drawings of the curves.
+const CURVE_INTERVAL: Duration = Duration::from_millis(200);
+/// Characters of a curve.
+const CURVE: usize = 30;
 
 /// Prints to standard error.
 pub struct Progress {
@@ -18,16 +23,28 @@ pub struct Progress {
     epoch_started: Instant,
     images_before: usize,
     last_line: Instant,
+    /// Losses of the batches of the epoch under way.
+    batch_losses: Vec<f64>,
+    /// Of the epochs that are done: training and validation loss.
+    losses: [Vec<f64>; 2],
 }
 
 impl Progress {
     /// For a run that is about to begin.
     pub fn new() -> Progress {
-        let style = "epoch {prefix} [{bar:30}] {pos}/{len} images, {msg}, {eta} left";
+        let style = "epoch {prefix} [{bar:30}] {pos}/{len} images, {eta} left, {msg}";
         let style = ProgressStyle::with_template(style).expect("the template is valid").progress_chars("=> ");
         let bar = std::io::stderr().is_terminal().then(|| ProgressBar::new(0).with_style(style));
         let now = Instant::now();
-        Progress { bar, epoch: 0, epoch_started: now, images_before: 0, last_line: now }
+        Progress {
+            bar,
+            epoch: 0,
+            epoch_started: now,
+            images_before: 0,
+            last_line: now,
+            batch_losses: Vec::new(),
+            losses: Default::default(),
+        }
     }
 
     fn print(&self, text: &str) {
@@ -36,6 +53,18 @@ impl Progress {
             None => eprintln!("{text}"),
         }
     }
+
+    /// The curves below the bar: the losses of the epoch's batches, and those of the epochs before.
+    fn curves(&self) -> String {
+        let mut text = String::new();
+        let [training, validation] = &self.losses;
+        for (name, values) in [("this epoch", &self.batch_losses), ("training", training), ("validation", validation)] {
+            if let Some(last) = values.last() {
+                text += &format!("\n  {name:<10} loss {:<CURVE$} {last:.4}", sparkline(values, CURVE));
+            }
+        }
+        text
+    }
 }
 
 impl Observer for Progress {
@@ -43,9 +72,10 @@ impl Observer for Progress {
         self.print(text);
     }
 
-    fn progress(&mut self, epoch: u32, images: usize, of: usize) {
+    fn progress(&mut self, epoch: u32, images: usize, of: usize, loss: f64) {
         if epoch != self.epoch {
             (self.epoch, self.epoch_started, self.images_before) = (epoch, Instant::now(), images);
+            self.batch_losses.clear();
             if let Some(bar) = &self.bar {
                 bar.set_prefix(epoch.to_string());
                 bar.set_length(of as u64);
@@ -55,7 +85,11 @@ impl Observer for Progress {
         let rate = (images - self.images_before) as f64 / self.epoch_started.elapsed().as_secs_f64().max(1e-9);
         match &self.bar {
             Some(bar) => {
-                bar.set_message(format!("{rate:.0} images/s"));
+                self.batch_losses.push(loss);
+                if self.last_line.elapsed() >= CURVE_INTERVAL {
+                    self.last_line = Instant::now();
+                    bar.set_message(format!("{rate:.0} images/s{}", self.curves()));
+                }
                 bar.set_position(images as u64);
             }
             None if self.last_line.elapsed() >= PLAIN_INTERVAL => {
@@ -68,6 +102,8 @@ impl Observer for Progress {
     }
 
     fn epoch(&mut self, record: &EpochRecord, of: u32) {
+        self.losses[0].push(record.train_loss);
+        self.losses[1].extend(record.val_mse);
         if let Some(bar) = &self.bar {
             bar.set_position(bar.length().unwrap_or(0));
         }

@@ -9,6 +9,7 @@ use super::share_bar::ShareBar;
 use super::{pool, print_json, stop_on_ctrl_c};
 use crate::error::Result;
 use crate::simulator::expert::Style;
+use crate::simulator::recorder::RECORD_HZ;
 use crate::simulator::{LogFormat, RecordOptions, Track, record};
 
 /// Record the expert driver in the simulator, in the format of Udacity's simulator
@@ -38,6 +39,9 @@ pub struct RecordArgs {
     /// Standard deviation of a disturbance of the steering that the labels do not show
     #[arg(long, default_value_t = 0.0)]
     noise: f64,
+    /// Rows of the log for each second: 1, 2, 5, 10, 25 or 50
+    #[arg(long, default_value_t = RECORD_HZ, value_name = "ROWS")]
+    hz: u64,
     /// How the log is written
     #[arg(long, value_enum, default_value_t = Format::Sample)]
     format: Format,
@@ -81,6 +85,7 @@ pub fn run(args: RecordArgs) -> Result<()> {
         seed: args.seed,
         speed_mph: args.speed,
         noise: args.noise,
+        hz: args.hz,
         format: match args.format {
             Format::Sample => LogFormat::Sample,
             Format::V2 => LogFormat::V2,

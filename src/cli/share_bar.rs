@@ -6,6 +6,8 @@ use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
 
+use crate::main_job::job::Stages;
+
 /// Time between plain progress lines.
 const PLAIN_INTERVAL: Duration = Duration::from_secs(10);
 /// Steps of the bar.
@@ -62,5 +64,19 @@ impl Drop for ShareBar {
         if let Some(bar) = &self.bar {
             bar.finish_and_clear();
         }
+    }
+}
+
+/// Shows each stage of a job as a bar of its own.
+pub struct Bars;
+
+impl Stages for Bars {
+    fn begin(&self, what: &str) -> Box<dyn Fn(f64) + Sync> {
+        let bar = ShareBar::new(what);
+        Box::new(move |share| bar.set(share))
+    }
+
+    fn notice(&self, text: &str) {
+        eprintln!("{text}");
     }
 }

@@ -11,11 +11,11 @@ use super::share_bar::ShareBar;
 use super::{or_dash, print_json, stop_on_ctrl_c};
 use crate::atomic_file;
 use crate::error::{Error, Result};
+use crate::new_folder::create_now;
 use crate::serve::client::{ClientOptions, ClientReport, Numbers, Observer, Pace, ServerUrl, drive};
 use crate::serve::protocol::DecimalMark;
 use crate::simulator::Track;
 use crate::simulator::drive::trajectory_csv;
-use crate::simulator::recorder::create_new_folder;
 use crate::simulator::run::{Failure, line_errors_m};
 use crate::simulator::statistics::quantile;
 
@@ -198,7 +198,7 @@ pub fn run(args: SimArgs) -> Result<()> {
     let report = drive(&track, &options, &mut progress)?;
     drop(progress);
     if let Some(out) = &args.out {
-        create_new_folder(out)?;
+        create_now(out)?;
         atomic_file::write(&out.join(format!("free_{}.csv", args.seed)), trajectory_csv(&report.run).as_bytes())?;
     }
     let summary = Summary::new(&args, &track, &report);

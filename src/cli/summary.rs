@@ -6,13 +6,15 @@ use clap::Args;
 use serde::Serialize;
 use steersman_kernels::Isa;
 
-use super::{RecipeArgs, print, print_json};
+use super::{RecipeArgs, print, print_json, refuse_existing};
+use crate::atomic_file;
 use crate::error::Result;
 use crate::model_file::Model;
 use crate::network::{NamedLayer, Network};
 use crate::recipe::Recipe;
+use crate::report::network_diagram;
 
-/// Print the layer table of a recipe or a model
+/// Print the layer table of a recipe or a model, or draw it
 #[derive(Debug, Args)]
 pub struct SummaryArgs {
     /// A model file; without one, the recipe's network is shown
@@ -20,6 +22,9 @@ pub struct SummaryArgs {
     model: Option<PathBuf>,
     #[command(flatten)]
     recipe: RecipeArgs,
+    /// Draw the network into this SVG file, which must not exist
+    #[arg(long, value_name = "FILE")]
+    svg: Option<PathBuf>,
     /// Print one JSON object as the last line
     #[arg(long)]
     json: bool,
@@ -77,6 +82,13 @@ pub fn run(args: SummaryArgs) -> Result<()> {
         None => args.recipe.find()?,
     };
     let network = recipe.network(Isa::best())?;
+    if let Some(path) = &args.svg {
+        refuse_existing(path)?;
+        let title =
+            if recipe.about.is_empty() { recipe.name.clone() } else { format!("{}: {}", recipe.name, recipe.about) };
+        atomic_file::write(path, network_diagram::draw(&network, &title).as_bytes())?;
+        eprintln!("wrote {}", path.display());
+    }
     if args.json {
         return print_json(&Table::of(&recipe, &network));
     }
@@ -85,6 +97,9 @@ pub fn run(args: SummaryArgs) -> Result<()> {
 
 fn training_line(model: &Model) -> String {
     let record = &model.record;
+    if record.epochs == 0 && record.recordings.is_empty() {
+        return "not trained here".into();
+    }
     format!(
         "{} epochs on {} (seed {}, {}), validation MSE {}",
         record.epochs,

@@ -1,19 +1,18 @@
 //! `steersman train`: the main job.
 
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use clap::Args;
 
 use super::progress::Progress;
-use super::share_bar::ShareBar;
+use super::share_bar::Bars;
 use super::{RecipeArgs, or_dash, pool, print_json, stop_on_ctrl_c};
 use crate::error::{Error, Result};
 use crate::main_job::held_out::trained_on_held_out;
-use crate::main_job::{MainJobResult, TRACKS, TrackResult, held_out, test_on_track, training_set};
-use crate::pilot::Pilot;
-use crate::simulator::{DriveOptions, Track};
+use crate::main_job::job::{Job, JobNote, JobRequest};
+use crate::main_job::{MainJobResult, TrackResult, held_out};
+use crate::report;
 use crate::training::{self, RunFolder, TrainRequest, TrainResult};
 
 /// Train a network on recordings
@@ -43,6 +42,11 @@ pub struct TrainArgs {
     /// Without a recording: runs of the finished model on each track, of one lap
     #[arg(long, default_value_t = 1, conflicts_with_all = ["recordings", "resume"])]
     runs: usize,
+    /// Without a recording: after the training the model drives N times through the training tracks, the expert labels what
+    /// it met there, and training begins anew on all recordings (DAgger)
+    #[arg(long, default_value_t = 0, value_name = "N", conflicts_with_all = ["recordings", "resume"],
+          value_parser = clap::value_parser!(u32).range(..=20))]
+    dagger: u32,
     /// Train on recordings of held-out tracks all the same
     #[arg(long)]
     force_held_out: bool,
@@ -51,9 +55,6 @@ pub struct TrainArgs {
     json: bool,
 }
 
-/// Where the main job keeps what it records.
-const RECORDINGS: &str = "data/recordings";
-
 pub fn run(args: TrainArgs) -> Result<()> {
     let started = Instant::now();
     if args.runs == 0 {
@@ -61,90 +62,89 @@ pub fn run(args: TrainArgs) -> Result<()> {
     }
     let stop = stop_on_ctrl_c()?;
     let pool = pool(args.threads)?;
-    let whole_job = args.resume.is_none() && args.recordings.is_empty();
+    let mut progress = Progress::new();
+    let note = match &args.resume {
+        Some(folder) => JobNote::read(folder)?,
+        None if args.recordings.is_empty() => Some(JobNote { runs: args.runs, dagger_rounds: args.dagger, round: 0 }),
+        None => None,
+    };
+    if let Some(note) = note {
+        let bars = Bars;
+        let mut job = Job::new(note, &mut progress, &bars, &stop);
+        let result = match args.resume {
+            Some(folder) => pool.install(|| job.go_on(&folder)),
+            None => {
+                let recipe = args.recipe.find()?;
+                let out = args.out.unwrap_or_else(|| RunFolder::next_free(&recipe.name));
+                let request = JobRequest { recipe, out, seed: args.seed, cache_mib: args.cache };
+                pool.install(|| job.begin(request))
+            }
+        };
+        let result = explain_stop(result, job.folder())?;
+        if let Some(folder) = job.folder() {
+            pool.install(|| write_report(folder));
+        }
+        if args.json {
+            return print_json(&result);
+        }
+        print_training(&result.training);
+        print_drives(&result);
+        println!(
+            "\nall of it took {:.0} s; drive with: steersman drive {} --track coast",
+            started.elapsed().as_secs_f64(),
+            result.training.model.display()
+        );
+        return Ok(());
+    }
     let (folder, result) = match args.resume {
         Some(folder) => {
-            let mut progress = Progress::new();
             let result = pool.install(|| training::resume(&folder, &mut progress, &stop));
             (folder, result)
         }
         None => {
             let recipe = args.recipe.find()?;
-            let recordings = match whole_job {
-                true => pool.install(|| training_set(&stop))?,
-                false => args.recordings,
-            };
-            let held_out = held_out::check(&recordings, args.force_held_out)?;
+            let held_out = held_out::check(&args.recordings, args.force_held_out)?;
             if !held_out.is_empty() {
                 eprintln!("note: {}", trained_on_held_out(&held_out));
             }
             let out = args.out.unwrap_or_else(|| RunFolder::next_free(&recipe.name));
-            let mut progress = Progress::new();
-            let request = TrainRequest { recordings, recipe, out: out.clone(), seed: args.seed, cache_mib: args.cache };
+            let request = TrainRequest {
+                recordings: args.recordings,
+                recipe,
+                out: out.clone(),
+                seed: args.seed,
+                cache_mib: args.cache,
+            };
             let result = pool.install(|| training::train(request, &mut progress, &stop));
             (out, result)
         }
     };
-    match result {
-        Ok(training) if whole_job => {
-            let last = folder.join("last.safetensors");
-            let drives = pool.install(|| drives(&last, args.runs, &stop))?;
-            let result = MainJobResult { training, drives };
-            if args.json {
-                return print_json(&result);
-            }
-            print_training(&result.training);
-            print_drives(&result.drives);
-            println!(
-                "\nall of it took {:.0} s; drive with: steersman drive {} --track coast",
-                started.elapsed().as_secs_f64(),
-                last.display()
-            );
-            Ok(())
-        }
-        Ok(result) if args.json => print_json(&result),
-        Ok(result) => {
-            print_training(&result);
-            Ok(())
-        }
-        Err(Error::Interrupted) => {
-            eprintln!("stopped and saved; go on with: steersman train --resume {}", folder.display());
-            Err(Error::Interrupted)
-        }
-        Err(error) => Err(error),
+    let result = explain_stop(result, Some(&folder))?;
+    pool.install(|| write_report(&folder));
+    if args.json {
+        return print_json(&result);
+    }
+    print_training(&result);
+    Ok(())
+}
+
+/// Writes the page of the finished run in `folder`. The run is saved; a page that cannot be written takes nothing from it.
+fn write_report(folder: &Path) {
+    match report::run::write(folder) {
+        Ok(page) => eprintln!("report {}", page.display()),
+        Err(error) => eprintln!("note: no report.html: {error}"),
     }
 }
 
-/// The recordings of the main job, recorded now if they are not there.
-fn training_set(stop: &AtomicBool) -> Result<Vec<PathBuf>> {
-    let bar = ShareBar::new("recording the expert");
-    let progress = |share| {
-        bar.set(share);
-        !stop.load(Ordering::Relaxed)
-    };
-    let takes = training_set::takes();
-    let (paths, reused) = training_set::recordings(Path::new(RECORDINGS), &takes, &progress)?;
-    drop(bar);
-    let verb = if reused { "found" } else { "recorded" };
-    eprintln!("{verb} the training set of {} recordings under {RECORDINGS}", paths.len());
-    Ok(paths)
-}
-
-/// Drives `model` on every track of the main job. It gets the weights of the last epoch: those with the lowest validation
-/// error may be an early epoch's, which predicts well and drives badly.
-fn drives(model: &Path, runs: usize, stop: &AtomicBool) -> Result<Vec<TrackResult>> {
-    let pilot = Pilot::load(model)?;
-    let options = DriveOptions { runs, ..Default::default() };
-    let on_track = |name: &&str| {
-        let track = Track::load(name)?;
-        let bar = ShareBar::new(format!("driving on {name}"));
-        let progress = |share| {
-            bar.set(share);
-            !stop.load(Ordering::Relaxed)
-        };
-        test_on_track(&pilot, &track, &options, &progress)
-    };
-    TRACKS.iter().map(on_track).collect()
+/// Says after a stop how to go on: with the run in `folder`, if there is one.
+fn explain_stop<T>(result: Result<T>, folder: Option<&Path>) -> Result<T> {
+    if let Err(Error::Interrupted) = &result {
+        match folder {
+            Some(folder) => eprintln!("stopped and saved; go on with: steersman train --resume {}", folder.display()),
+            None => eprintln!("stopped; nothing was trained yet, and what was recorded is not kept"),
+        }
+    }
+    result
 }
 
 fn print_training(result: &TrainResult) {
@@ -158,7 +158,7 @@ fn print_training(result: &TrainResult) {
         result.leak_percent
     );
     println!(
-        "best epoch {}: validation MSE {}; centre camera {}, MAE {} deg, {} of the error of predicting zero",
+        "epoch {}: validation MSE {}; centre camera {}, MAE {} deg, {} of the error of predicting zero",
         result.best_epoch,
         or_dash(result.val_mse, 4),
         or_dash(result.val_center_mse, 4),
@@ -168,9 +168,10 @@ fn print_training(result: &TrainResult) {
     println!("model {}", result.model.display());
 }
 
-fn print_drives(drives: &[TrackResult]) {
-    println!("\ntrack                       offline MAE     laps  autonomy  interventions  mean distance from line");
-    for TrackResult { drive, offline_mae_deg } in drives {
+fn print_drives(result: &MainJobResult) {
+    println!("\nThe weights of epoch {} drive, one lap a run:", result.training.best_epoch);
+    println!("track                       offline MAE     laps  autonomy  interventions  mean distance from line");
+    for TrackResult { drive, offline_mae_deg } in &result.drives {
         let name = format!("{} ({})", drive.track, if drive.held_out { "held out" } else { "trained" });
         let laps = format!("{}/{}", drive.laps_completed, drive.laps_total);
         println!(

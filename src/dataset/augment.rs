@@ -1,7 +1,8 @@
-//! Random changes to training images: brightness, a shadow, a horizontal shift. Validation and driving never see them.
+//! Random changes to training images: a horizontal shift, a shadow, colours, brightness. Validation and driving never see
+//! them.
 //!
 //! They act on the RGB stage of preprocessing (cropped, before the colour conversion), in this order: shift, shadow,
-//! brightness. Each is drawn anew for every sample and epoch.
+//! colours, brightness. Each is drawn anew for every sample and epoch.
 
 use super::preprocess::Preprocessing;
 use crate::random::{uniform, unit};
@@ -26,6 +27,17 @@ pub struct Augmentation {
     /// so the car has to steer there. Needed with `shift_px`; 0.002 to 0.003 is usual.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub shift_steering_per_px: Option<f64>,
+    /// Largest turn of the hue either way, in degrees: a turn about the axis of grays.
+    pub hue_deg: f64,
+    /// Range of the factor of the distance from gray: 0 leaves a gray picture.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub saturation: Option<[f64; 2]>,
+    /// Range of the factors, one for each channel, that red, green and blue are multiplied by: the tint of the light.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub tint: Option<[f64; 2]>,
+    /// Range of the factor of the distance from the picture's mean grey level.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub contrast: Option<[f64; 2]>,
 }
 
 impl Default for Augmentation {
@@ -36,6 +48,10 @@ impl Default for Augmentation {
             shadow_strength: [0.2, 0.5],
             shift_px: 0.0,
             shift_steering_per_px: None,
+            hue_deg: 0.0,
+            saturation: None,
+            tint: None,
+            contrast: None,
         }
     }
 }
@@ -43,7 +59,11 @@ impl Default for Augmentation {
 impl Augmentation {
     /// Whether anything is changed at all.
     pub fn is_active(&self) -> bool {
-        self.brightness.is_some() || self.shadow_probability > 0.0 || self.shift_px > 0.0
+        self.brightness.is_some() || self.shadow_probability > 0.0 || self.shift_px > 0.0 || self.changes_colours()
+    }
+
+    fn changes_colours(&self) -> bool {
+        self.hue_deg > 0.0 || self.saturation.is_some() || self.tint.is_some() || self.contrast.is_some()
     }
 
     /// Checks the numbers.
@@ -53,11 +73,18 @@ impl Augmentation {
     pub fn validate(&self) -> Result<()> {
         let wrong = |key: &str, must: &str| Err(Error::Usage(format!("[augmentation] {key}: {must}")));
         let is_range = |[low, high]: [f64; 2]| 0.0 <= low && low <= high && high <= 10.0;
-        if !self.brightness.is_none_or(is_range) {
-            return wrong("brightness", "must be [low, high] with 0 <= low <= high <= 10");
+        let ranges = [
+            ("brightness", self.brightness),
+            ("shadow_strength", Some(self.shadow_strength)),
+            ("saturation", self.saturation),
+            ("tint", self.tint),
+            ("contrast", self.contrast),
+        ];
+        if let Some((key, _)) = ranges.into_iter().find(|(_, range)| !range.is_none_or(is_range)) {
+            return wrong(key, "must be [low, high] with 0 <= low <= high <= 10");
         }
-        if !is_range(self.shadow_strength) {
-            return wrong("shadow_strength", "must be [low, high] with 0 <= low <= high <= 10");
+        if !(0.0..=180.0).contains(&self.hue_deg) {
+            return wrong("hue_deg", "must be 0 to 180");
         }
         if !(0.0..=1.0).contains(&self.shadow_probability) {
             return wrong("shadow_probability", "must be 0 to 1");
@@ -89,6 +116,17 @@ impl Augmentation {
             if chance < self.shadow_probability {
                 shadow(rgb, width, top, bottom, side < 0.5, &factors(factor));
             }
+        }
+        if self.changes_colours() {
+            let drawn = |range: Option<[f64; 2]>, rng: &mut _| {
+                let [low, high] = range.unwrap_or([1.0, 1.0]);
+                uniform(rng, low, high)
+            };
+            let turn = uniform(rng, -self.hue_deg, self.hue_deg).to_radians();
+            let saturation = drawn(self.saturation, rng);
+            let tint = [(); 3].map(|()| drawn(self.tint, rng));
+            let contrast = drawn(self.contrast, rng);
+            recolour(rgb, turn, saturation, tint, contrast);
         }
         if let Some([low, high]) = self.brightness {
             let table = factors(uniform(rng, low, high));
@@ -130,6 +168,32 @@ fn shadow(rgb: &mut [u8], width: usize, top: f64, bottom: f64, left: bool, table
         let (before, after) = row.split_at_mut(edge);
         let dark = if left { before } else { after };
         dark.iter_mut().for_each(|grey| *grey = table[usize::from(*grey)]);
+    }
+}
+
+/// Turns the hue by `turn` rad, multiplies the distance from gray by `saturation` and each channel by its `tint`, then the
+/// distance from the mean grey level by `contrast`.
+///
+/// The turn is about the axis of grays in RGB (Rodrigues' formula with the axis (1, 1, 1) / sqrt 3): it keeps the sum of the
+/// three channels.
+fn recolour(rgb: &mut [u8], turn: f64, saturation: f64, tint: [f64; 3], contrast: f64) {
+    let (sin, cos) = turn.sin_cos();
+    let (along, aside) = ((1.0 - saturation * cos) / 3.0, saturation * sin / 3f64.sqrt());
+    // The matrix is circulant: the diagonal, then the two others in turn.
+    let (d, a, b) = (saturation * cos + along, along - aside, along + aside);
+    let rows = [[d, a, b], [b, d, a], [a, b, d]];
+    let sums = rgb.chunks_exact(3).fold([0u64; 3], |sums, px| std::array::from_fn(|k| sums[k] + u64::from(px[k])));
+    let means = sums.map(|sum| sum as f64 / (rgb.len() / 3).max(1) as f64);
+    let dot = |row: &[f64; 3]| row[0] * means[0] + row[1] * means[1] + row[2] * means[2];
+    let grey = (0..3).map(|k| tint[k] * dot(&rows[k])).sum::<f64>() / 3.0;
+    let rows: [[f32; 3]; 3] = std::array::from_fn(|k| rows[k].map(|v| (v * tint[k] * contrast) as f32));
+    // Half a grey level more, as the conversion to bytes cuts off.
+    let offset = (grey * (1.0 - contrast) + 0.5) as f32;
+    for px in rgb.chunks_exact_mut(3) {
+        let [r, g, b] = [f32::from(px[0]), f32::from(px[1]), f32::from(px[2])];
+        for (out, [wr, wg, wb]) in px.iter_mut().zip(&rows) {
+            *out = (wr * r + wg * g + wb * b + offset) as u8;
+        }
     }
 }
 
@@ -191,11 +255,50 @@ mod tests {
     }
 
     #[test]
+    fn colours_turn_about_the_axis_of_grays_and_spread_about_the_mean() {
+        let changed = |turn_deg: f64, saturation, tint, contrast| {
+            let mut rgb = vec![200, 80, 40, 90, 90, 90];
+            recolour(&mut rgb, turn_deg.to_radians(), saturation, tint, contrast);
+            rgb
+        };
+        assert_eq!(changed(0.0, 1.0, [1.0; 3], 1.0), [200, 80, 40, 90, 90, 90]);
+        // A third of the circle makes green of red, and so on; grays stay.
+        assert_eq!(changed(120.0, 1.0, [1.0; 3], 1.0), [40, 200, 80, 90, 90, 90]);
+        assert_eq!(changed(0.0, 0.0, [1.0; 3], 1.0), [107, 107, 107, 90, 90, 90]);
+        assert_eq!(changed(0.0, 1.0, [1.1, 1.0, 0.5], 1.0), [220, 80, 20, 99, 90, 45]);
+        // The mean grey level is 98.3.
+        assert_eq!(changed(0.0, 1.0, [1.0; 3], 0.5), [149, 89, 69, 94, 94, 94]);
+        assert_eq!(changed(0.0, 1.0, [1.0; 3], 2.0), [255, 62, 0, 82, 82, 82]);
+        let turned = changed(40.0, 0.8, [1.0; 3], 1.0);
+        assert!((turned[..3].iter().map(|&c| i32::from(c)).sum::<i32>() - 320).abs() <= 1, "{turned:?}");
+    }
+
+    #[test]
+    fn colours_are_drawn_anew_and_without_them_nothing_changes() {
+        let table = "hue_deg = 40\nsaturation = [0.2, 1.5]\ntint = [0.8, 1.2]\ncontrast = [0.5, 1.5]";
+        let colours: Augmentation = toml::from_str(table).unwrap();
+        assert!(colours.is_active() && colours.validate().is_ok());
+        let draw = |augmentation: &Augmentation, stream| {
+            let mut rgb: Vec<u8> = (0..4 * 10 * 3).map(|i| (i * 2) as u8).collect();
+            assert_eq!(augmentation.apply(&preprocessing(), &mut rgb, &mut rng(1, Purpose::Test, 0, stream)), 0.0);
+            rgb
+        };
+        assert_ne!(draw(&colours, 0), draw(&colours, 1));
+        assert_eq!(draw(&colours, 0), draw(&colours, 0));
+        assert_eq!(draw(&Augmentation::default(), 0)[..4], [0, 2, 4, 6]);
+    }
+
+    #[test]
     fn tables_are_checked() {
         assert!(!Augmentation::default().is_active() && Augmentation::default().validate().is_ok());
         let shift: Augmentation = toml::from_str("shift_px = 50").unwrap();
         assert!(shift.is_active() && shift.validate().unwrap_err().to_string().contains("shift_steering_per_px"));
         assert!(toml::from_str::<Augmentation>("brightness = [1.2, 0.8]").unwrap().validate().is_err());
         assert!(toml::from_str::<Augmentation>("blur = 1").is_err());
+        for wrong in ["hue_deg = 200", "saturation = [-1, 1]", "tint = [1, 0.5]", "contrast = [0, 11]"] {
+            let key = wrong.split(' ').next().unwrap();
+            let error = toml::from_str::<Augmentation>(wrong).unwrap().validate().unwrap_err().to_string();
+            assert!(error.contains(key), "{error}");
+        }
     }
 }

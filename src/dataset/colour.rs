@@ -15,6 +15,8 @@ pub enum Colour {
     /// Red, green, blue.
     #[default]
     Rgb,
+    /// Blue, green, red: what a network saw that was trained on the images of OpenCV's `imread`.
+    Bgr,
     /// Y, U, V with BT.601 weights, U and V centred at 128 (`COLOR_RGB2YUV`).
     Yuv,
     /// The same with red and blue exchanged: what `COLOR_RGB2YUV` gave up to OpenCV 3.1, and what
@@ -33,6 +35,39 @@ pub enum Colour {
 }
 
 impl Colour {
+    /// All of them.
+    pub const ALL: [Colour; 9] = [
+        Colour::Rgb,
+        Colour::Bgr,
+        Colour::Yuv,
+        Colour::YuvOld,
+        Colour::Hsv,
+        Colour::Saturation,
+        Colour::Hls,
+        Colour::Lab,
+        Colour::Gray,
+    ];
+
+    /// Name in recipes.
+    pub fn name(self) -> &'static str {
+        ["rgb", "bgr", "yuv", "yuv-old", "hsv", "saturation", "hls", "lab", "gray"][self as usize]
+    }
+
+    /// Names of the planes.
+    pub fn plane_names(self) -> &'static [&'static str] {
+        match self {
+            Colour::Rgb => &["red", "green", "blue"],
+            Colour::Bgr => &["blue", "green", "red"],
+            Colour::Yuv => &["Y", "U", "V"],
+            Colour::YuvOld => &["Y", "U", "V (red and blue exchanged)"],
+            Colour::Hsv => &["hue", "saturation", "value"],
+            Colour::Saturation => &["saturation"],
+            Colour::Hls => &["hue", "lightness", "saturation"],
+            Colour::Lab => &["L*", "a*", "b*"],
+            Colour::Gray => &["luminance"],
+        }
+    }
+
     /// Number of planes.
     pub fn channels(self) -> usize {
         match self {
@@ -50,6 +85,7 @@ impl Colour {
         assert_eq!(planes.len(), pixels * self.channels(), "planes of {self:?} for {pixels} pixels");
         match self {
             Colour::Rgb => three(rgb, planes, |p| p),
+            Colour::Bgr => three(rgb, planes, |[r, g, b]| [b, g, r]),
             Colour::Yuv => three(rgb, planes, yuv),
             Colour::YuvOld => three(rgb, planes, |[r, g, b]| yuv([b, g, r])),
             Colour::Hsv => {
@@ -232,6 +268,7 @@ mod tests {
         // From the definitions; red has hue 0, green 120 deg = 60 steps, blue 240 deg = 120 steps.
         let (red, green, blue, grey) = ([255, 0, 0], [0, 255, 0], [0, 0, 255], [100, 100, 100]);
         assert_eq!(convert(Colour::Rgb, [1, 2, 3]), [1, 2, 3]);
+        assert_eq!(convert(Colour::Bgr, [1, 2, 3]), [3, 2, 1]);
         assert_eq!(convert(Colour::Yuv, red), [76, 91, 255]);
         assert_eq!(convert(Colour::YuvOld, red), [29, 239, 103]);
         assert_eq!(convert(Colour::Yuv, grey), [100, 128, 128]);

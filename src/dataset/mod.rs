@@ -33,4 +33,4 @@ pub use recording::{ASSUMED_STEP_MS, Camera, Kind, Reason, Recording, Row, SESSI
 pub use samples::{Balance, Flip, Group, Item, SampleSpec};
 
 #[cfg(test)]
-mod testing;
+pub(crate) mod testing;

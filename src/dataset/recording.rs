@@ -211,6 +211,16 @@ impl Recording {
         median(steps.collect()).map(|ms| 1000.0 / ms as f64)
     }
 
+    /// Which session `row` belongs to.
+    ///
+    /// # Panics
+    /// If there is no such row.
+    pub fn session_of(&self, row: usize) -> usize {
+        let session = self.sessions.partition_point(|session| session.end <= row);
+        assert!(session < self.sessions.len(), "row {row} of {}", self.rows.len());
+        session
+    }
+
     /// Seconds driven: the sum over the sessions.
     pub fn driven_s(&self) -> f64 {
         self.sessions.iter().map(|session| self.session_s(session)).sum()

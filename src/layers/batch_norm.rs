@@ -17,7 +17,7 @@ use crate::tensor::Shape;
 /// The running variance keeps the population variance (divided by N, as in Keras 1, not by N − 1).
 ///
 /// Parameters: `gamma` and `beta` `[c]`; statistics: `running_mean` and `running_variance` `[c]`.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub struct BatchNorm {
     shape: Shape,
     epsilon: f32,
@@ -38,7 +38,8 @@ impl BatchNorm {
         Ok(BatchNorm { shape, epsilon, running_old_weight, isa })
     }
 
-    fn split<'a>(&self, moments: &'a [f32]) -> Moments<'a> {
+    /// The parts of what the barrier has found out.
+    pub(super) fn split<'a>(&self, moments: &'a [f32]) -> Moments<'a> {
         let mut parts = moments.chunks_exact(self.shape.c);
         let mut next = || parts.next().expect("moments have 7 values a channel");
         Moments {
@@ -53,17 +54,48 @@ impl BatchNorm {
     }
 }
 
+impl BatchNorm {
+    /// Evaluation's `y = x · scale + shift`, from the running statistics; `scratch` has at least 2 c numbers.
+    pub(super) fn scale_and_shift<'a>(
+        &self,
+        params: &[f32],
+        statistics: &[f32],
+        scratch: &'a mut [f32],
+    ) -> (&'a [f32], &'a [f32]) {
+        let c = self.shape.c;
+        let (gamma, beta) = params.split_at(c);
+        let (mean, variance) = statistics.split_at(c);
+        let (scale, shift) = scratch[..2 * c].split_at_mut(c);
+        for i in 0..c {
+            scale[i] = gamma[i] / (variance[i] + self.epsilon).sqrt();
+            shift[i] = beta[i] - mean[i] * scale[i];
+        }
+        (scale, shift)
+    }
+
+    /// Adds the gradients of gamma and beta that follow from the sums of the backward pass.
+    pub(super) fn add_gradients(&self, sums: &[f64], dparams: &mut [f32]) {
+        let c = self.shape.c;
+        let (dgamma, dbeta) = dparams.split_at_mut(c);
+        for i in 0..c {
+            dgamma[i] += sums[c + i] as f32;
+            dbeta[i] += sums[i] as f32;
+        }
+    }
+}
+
 /// What the whole batch says of each channel; every slice has `[c]` numbers.
-struct Moments<'a> {
-    mean: &'a [f32],
-    inv_std: &'a [f32],
+#[derive(Clone, Copy)]
+pub(super) struct Moments<'a> {
+    pub mean: &'a [f32],
+    pub inv_std: &'a [f32],
     /// `y = x · scale + shift`.
-    scale: &'a [f32],
-    shift: &'a [f32],
-    mean_dy: &'a [f32],
-    mean_dy_xhat: &'a [f32],
+    pub scale: &'a [f32],
+    pub shift: &'a [f32],
+    pub mean_dy: &'a [f32],
+    pub mean_dy_xhat: &'a [f32],
     /// `gamma · inv_std`.
-    gain: &'a [f32],
+    pub gain: &'a [f32],
 }
 
 const MOMENTS: usize = 7;
@@ -92,15 +124,8 @@ impl Layer for BatchNorm {
     }
 
     fn infer(&self, params: &[f32], statistics: &[f32], n: usize, x: &[f32], y: &mut [f32], scratch: &mut [f32]) {
-        let c = self.shape.c;
-        let (gamma, beta) = params.split_at(c);
-        let (mean, variance) = statistics.split_at(c);
-        let (scale, shift) = scratch[..2 * c].split_at_mut(c);
-        for i in 0..c {
-            scale[i] = gamma[i] / (variance[i] + self.epsilon).sqrt();
-            shift[i] = beta[i] - mean[i] * scale[i];
-        }
-        norm::normalize(self.isa, n, c, self.shape.positions(), x, scale, shift, y);
+        let (scale, shift) = self.scale_and_shift(params, statistics, scratch);
+        norm::normalize(self.isa, n, self.shape.c, self.shape.positions(), x, scale, shift, y);
     }
 
     fn forward(&self, _params: &[f32], pass: &Pass, n: usize, x: &[f32], y: &mut [f32], _scratch: &mut [f32]) {
@@ -160,11 +185,7 @@ impl BatchStatistics for BatchNorm {
         let Moments { mean, inv_std, .. } = self.split(moments);
         sums.fill(0.0);
         norm::norm_backward_sums(self.isa, n, c, self.shape.positions(), x, dy, mean, inv_std, sums);
-        let (dgamma, dbeta) = dparams.split_at_mut(c);
-        for i in 0..c {
-            dgamma[i] += sums[c + i] as f32;
-            dbeta[i] += sums[i] as f32;
-        }
+        self.add_gradients(sums, dparams);
     }
 
     fn finish_backward(&self, params: &[f32], images: usize, sums: &[f64], moments: &mut [f32]) {

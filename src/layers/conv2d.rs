@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 use steersman_kernels::Isa;
 use steersman_kernels::conv::{Conv, ConvShape};
 
-use super::{Grads, Layer, Pair, ParamSpec, Pass};
+use super::{Grads, Layer, Linear, Pair, ParamSpec, Pass, Prepared};
 use crate::tensor::{Fans, Initializer, Shape};
 
 /// What lies beyond the border of the image.
@@ -21,7 +21,7 @@ pub enum Padding {
 
 impl Padding {
     /// Zeros before and after, along one axis.
-    fn amounts(self, size: usize, kernel: usize, stride: usize) -> (usize, usize) {
+    pub(crate) fn amounts(self, size: usize, kernel: usize, stride: usize) -> (usize, usize) {
         match self {
             Padding::Valid => (0, 0),
             Padding::Same => {
@@ -40,7 +40,7 @@ impl Padding {
 /// Training and evaluation are the same. Any kernel size and stride.
 ///
 /// Parameters: `weight` `[filters][channels][kernel height][kernel width]`, `bias` `[filters]`.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub struct Conv2d {
     conv: Conv,
     shape: ConvShape,
@@ -85,6 +85,16 @@ impl Conv2d {
         Ok(Conv2d { conv: Conv::new(shape, isa), shape, init })
     }
 
+    /// The kernel that computes it.
+    pub(super) fn kernel(&self) -> &Conv {
+        &self.conv
+    }
+
+    /// Weight and bias.
+    pub(super) fn split<'a>(&self, params: &'a [f32]) -> (&'a [f32], &'a [f32]) {
+        params.split_at(self.weight_len())
+    }
+
     fn weight_len(&self) -> usize {
         self.shape.oc * self.shape.c * self.shape.kh * self.shape.kw
     }
@@ -114,7 +124,7 @@ impl Layer for Conv2d {
     }
 
     fn infer(&self, params: &[f32], _statistics: &[f32], n: usize, x: &[f32], y: &mut [f32], scratch: &mut [f32]) {
-        let (weight, bias) = params.split_at(self.weight_len());
+        let (weight, bias) = self.split(params);
         self.conv.forward(n, x, weight, bias, y, scratch);
     }
 
@@ -126,8 +136,37 @@ impl Layer for Conv2d {
         let (dweight, dbias) = grads.dparams.split_at_mut(self.weight_len());
         self.conv.backward_weight(n, pair.x, pair.dy, dweight, dbias, grads.scratch);
         if let Some(dx) = dx {
-            self.conv.backward_input(n, pair.dy, &params[..self.weight_len()], dx, grads.scratch);
+            self.backward_input(params, n, pair.dy, dx, grads.scratch);
         }
+    }
+
+    fn prepared(&self) -> Option<&dyn Prepared> {
+        Some(self)
+    }
+
+    fn linear(&self) -> Option<&dyn Linear> {
+        Some(self)
+    }
+}
+
+impl Prepared for Conv2d {
+    fn prepared_len(&self) -> usize {
+        self.conv.packed_len()
+    }
+
+    fn prepare(&self, params: &[f32], prepared: &mut [f32]) {
+        let (weight, bias) = self.split(params);
+        self.conv.pack(weight, bias, prepared);
+    }
+
+    fn infer_prepared(&self, prepared: &[f32], n: usize, x: &[f32], y: &mut [f32], scratch: &mut [f32]) {
+        self.conv.forward_packed(n, x, prepared, y, scratch);
+    }
+}
+
+impl Linear for Conv2d {
+    fn backward_input(&self, params: &[f32], n: usize, dy: &[f32], dx: &mut [f32], scratch: &mut [f32]) {
+        self.conv.backward_input(n, dy, &params[..self.weight_len()], dx, scratch);
     }
 }
 

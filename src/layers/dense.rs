@@ -3,7 +3,7 @@
 use steersman_kernels::Isa;
 use steersman_kernels::gemm::{gemm, gemm_scratch_len};
 
-use super::{Grads, Layer, Pair, ParamSpec, Pass};
+use super::{Grads, Layer, Linear, Pair, ParamSpec, Pass};
 use crate::tensor::{Fans, Initializer, Shape};
 
 /// Fully connected layer with bias.
@@ -82,9 +82,20 @@ impl Layer for Dense {
             }
         }
         if let Some(dx) = dx {
-            let weight = &params[..inputs * units];
-            gemm(self.isa, n, units, inputs, 1.0, dy, (units, 1), weight, (inputs, 1), 0.0, dx, (inputs, 1), scratch);
+            self.backward_input(params, n, dy, dx, scratch);
         }
+    }
+
+    fn linear(&self) -> Option<&dyn Linear> {
+        Some(self)
+    }
+}
+
+impl Linear for Dense {
+    fn backward_input(&self, params: &[f32], n: usize, dy: &[f32], dx: &mut [f32], scratch: &mut [f32]) {
+        let (inputs, units) = (self.inputs, self.units);
+        let weight = &params[..inputs * units];
+        gemm(self.isa, n, units, inputs, 1.0, dy, (units, 1), weight, (inputs, 1), 0.0, dx, (inputs, 1), scratch);
     }
 }
 

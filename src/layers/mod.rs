@@ -29,22 +29,28 @@ mod dense;
 mod dropout;
 mod flatten;
 pub mod gradcheck;
+mod norm_rectify;
 mod pool;
+mod pooled_conv;
 mod prelu;
 mod scale;
+mod zero_pad;
 
 use std::fmt::Debug;
 
-pub use activation::{Elu, Relu};
+pub use activation::{Elu, LeakyRelu, Relu, Softsign, Tanh};
 pub use batch_norm::BatchNorm;
 pub use conv2d::{Conv2d, Padding};
 pub use crop::Crop;
 pub use dense::Dense;
 pub use dropout::Dropout;
 pub use flatten::Flatten;
+pub use norm_rectify::NormRectify;
 pub use pool::{AveragePool, MaxPool};
+pub use pooled_conv::{PooledConv, Rising};
 pub use prelu::{PRelu, Slopes};
 pub use scale::Scale;
+pub use zero_pad::ZeroPad;
 
 use crate::tensor::{Fans, Initializer, Shape};
 
@@ -157,6 +163,16 @@ pub trait Layer: Send + Sync + Debug {
     /// Gradients of the loss: overwrites `dx` where it is asked for, adds to `dparams`. `x` and `y` are those of `forward`.
     fn backward(&self, params: &[f32], pass: &Pass, n: usize, pair: Pair, dx: Option<&mut [f32]>, grads: Grads);
 
+    /// Evaluation with parameters prepared for it, for layers that gain by that.
+    fn prepared(&self) -> Option<&dyn Prepared> {
+        None
+    }
+
+    /// The input gradient by itself, for layers that find it from `dy` and the parameters alone.
+    fn linear(&self) -> Option<&dyn Linear> {
+        None
+    }
+
     /// The whole-batch barrier, for layers that need one.
     fn batch_statistics(&self) -> Option<&dyn BatchStatistics> {
         None
@@ -181,6 +197,25 @@ pub struct Grads<'a> {
     pub dparams: &'a mut [f32],
     /// Working space.
     pub scratch: &'a mut [f32],
+}
+
+/// A layer that reads its parameters in another order than they are kept in.
+pub trait Prepared {
+    /// How many numbers the prepared parameters are.
+    fn prepared_len(&self) -> usize;
+
+    /// Overwrites `prepared`.
+    fn prepare(&self, params: &[f32], prepared: &mut [f32]);
+
+    /// As [`Layer::infer`], to the same bits.
+    fn infer_prepared(&self, prepared: &[f32], n: usize, x: &[f32], y: &mut [f32], scratch: &mut [f32]);
+}
+
+/// A layer whose input gradient needs neither input nor output, so that it may take the place of the input once
+/// [`Layer::backward`] has found the gradients of the parameters.
+pub trait Linear {
+    /// Overwrites `dx`, as [`Layer::backward`] does.
+    fn backward_input(&self, params: &[f32], n: usize, dy: &[f32], dx: &mut [f32], scratch: &mut [f32]);
 }
 
 /// The barrier of a layer that looks at the whole batch at once (batch normalisation).

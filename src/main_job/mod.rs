@@ -1,6 +1,9 @@
 //! The main job: record the expert, train on it, drive where it was trained and where it was not.
 
+pub mod dagger;
+pub mod experiment;
 pub mod held_out;
+pub mod job;
 pub mod training_set;
 
 use serde::Serialize;
@@ -15,7 +18,17 @@ use crate::simulator::{
 use crate::training::TrainResult;
 
 /// Tracks that the main job drives on: those of the training set, then held-out ones.
-pub const TRACKS: [&str; 6] = ["lake", "mountain", "coast", "forest", "random:1000001", "random:1000002"];
+pub const TRACKS: [&str; 9] = [
+    "lake",
+    "mountain",
+    "coast",
+    "forest",
+    "random:1000001",
+    "random:1000002",
+    "random:1000003",
+    "random:1000004",
+    "random:1000005",
+];
 /// Frames of the expert's drive that the offline error is taken over.
 const OFFLINE_FRAMES: usize = 300;
 

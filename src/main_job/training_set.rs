@@ -12,6 +12,8 @@ use crate::simulator::{RecordOptions, Track, builtin, record};
 
 /// Random tracks in the set. Variety of looks teaches more than laps: each is driven for a fraction of a lap.
 const RANDOM_TRACKS: u64 = 48;
+/// Rows for each second: at 20 mph every 1.8 m. Twice the road teaches more than twice the frames.
+const HZ: u64 = 5;
 /// Seed of the first recording; far from those that drives begin with, so that starts and light are others.
 const FIRST_SEED: u64 = 101;
 
@@ -32,18 +34,19 @@ pub struct Take {
 
 impl Take {
     /// Name of the recording's folder.
-    fn folder(&self) -> String {
+    pub(super) fn folder(&self) -> String {
         let direction = if self.reverse { "-reverse" } else { "" };
         let kind = if self.recovery { "-recovery" } else { "" };
         format!("{}{direction}{kind}", self.track.replace(':', "-"))
     }
 
-    fn options(&self) -> RecordOptions {
+    pub(super) fn options(&self) -> RecordOptions {
         RecordOptions {
             laps: self.laps,
             reverse: self.reverse,
             recovery: self.recovery,
             seed: self.seed,
+            hz: HZ,
             ..Default::default()
         }
     }
@@ -58,7 +61,7 @@ pub fn takes() -> Vec<Take> {
         takes.push(Take { track: track.into(), laps, reverse, recovery, seed });
     };
     for track in ["lake", "mountain"] {
-        for (laps, recovery) in [(0.5, false), (0.25, true)] {
+        for (laps, recovery) in [(0.8, false), (0.4, true)] {
             take(track, laps, false, recovery);
             take(track, laps, true, recovery);
         }
@@ -66,8 +69,8 @@ pub fn takes() -> Vec<Take> {
     for number in 1..=RANDOM_TRACKS {
         let track = format!("random:{number}");
         let odd = number % 2 == 1;
-        take(&track, 0.08, odd, false);
-        take(&track, 0.06, !odd, true);
+        take(&track, 0.2, odd, false);
+        take(&track, 0.15, !odd, true);
     }
     takes
 }
@@ -77,12 +80,13 @@ fn settings(takes: &[Take]) -> Result<String> {
     #[derive(Serialize)]
     struct Settings<'a> {
         version: &'a str,
+        hz: u64,
         tracks_hash: String,
         take: &'a [Take],
     }
     let mut tracks = Sha256::new();
     builtin::names().filter_map(builtin::text).for_each(|text| tracks.update(text));
-    let settings = Settings { version: env!("CARGO_PKG_VERSION"), tracks_hash: digits(tracks), take: takes };
+    let settings = Settings { version: env!("CARGO_PKG_VERSION"), hz: HZ, tracks_hash: digits(tracks), take: takes };
     toml::to_string(&settings).map_err(|e| Error::Usage(format!("the training set cannot be described: {e}")))
 }
 
@@ -119,6 +123,28 @@ pub fn recordings(
     }
     std::fs::create_dir_all(folder).map_err(Error::io(folder))?;
     let unfinished = tempfile::Builder::new().prefix("unfinished-").tempdir_in(folder).map_err(Error::io(folder))?;
+    record_takes(takes, unfinished.path(), progress, |track, take, folder, progress| {
+        record(track, &take.options(), folder, progress).map(drop)
+    })?;
+    let side = unfinished.path().join("set.toml");
+    std::fs::write(&side, settings).map_err(Error::io(&side))?;
+    let unfinished = unfinished.keep();
+    std::fs::rename(&unfinished, &set).map_err(Error::io(&set))?;
+    Ok((paths, false))
+}
+
+/// Records `takes` into folders of their own under `folder`, each by `how` (track, take, its folder, progress), tracks in
+/// parallel. `progress` is told the share that is recorded and may return `false` to stop.
+///
+/// # Errors
+///
+/// [`Error::Usage`] for held-out tracks; as `how`.
+pub(super) fn record_takes(
+    takes: &[Take],
+    folder: &Path,
+    progress: &(dyn Fn(f64) -> bool + Sync),
+    how: impl Fn(&Track, &Take, &Path, &(dyn Fn(f64) -> bool + Sync)) -> Result<()> + Sync,
+) -> Result<()> {
     let shares = Mutex::new(vec![0.0; takes.len()]);
     let in_all: f64 = takes.iter().map(|take| take.laps).sum();
     let numbered: Vec<(usize, &Take)> = takes.iter().enumerate().collect();
@@ -134,14 +160,9 @@ pub fn recordings(
                 shares[number] = f64::max(shares[number], share * take.laps);
                 progress(shares.iter().sum::<f64>() / in_all)
             };
-            record(&track, &take.options(), &unfinished.path().join(take.folder()), &of_take).map(drop)
+            how(&track, take, &folder.join(take.folder()), &of_take)
         })
-    })?;
-    let side = unfinished.path().join("set.toml");
-    std::fs::write(&side, settings).map_err(Error::io(&side))?;
-    let unfinished = unfinished.keep();
-    std::fs::rename(&unfinished, &set).map_err(Error::io(&set))?;
-    Ok((paths, false))
+    })
 }
 
 #[cfg(test)]

@@ -1,25 +1,41 @@
 //! Evaluation: running statistics, no dropout, parameters shared and unchanged.
 
+use std::ops::Range;
+
 use ndarray::{Array2, ArrayView4};
 use rayon::prelude::*;
 
-use super::{Network, Parameters};
+use super::stages::{Kind, Stage, stages};
+use super::{LayerSpec, Network, Parameters};
 use crate::error::{Error, Result};
 use crate::tensor::Shape;
 
-/// Images that a worker takes through all layers at a time.
+/// Images that a worker takes through the dense layers at a time.
 const GROUP: usize = 8;
 
 /// The buffers of evaluation, planned once for a network and a largest batch.
+///
+/// Up to the first dense layer a worker takes one image at a time, so that its maps stay in the cache; from there on a
+/// group of images, so that the weights are read once for all of them.
 #[derive(Clone, Debug)]
 pub struct InferencePlan {
+    stages: Vec<Stage>,
+    /// How many stages there are before the first dense layer.
+    maps: usize,
+    /// What [`prepare`](InferencePlan::prepare) made of the parameters of each stage; empty where there is nothing to.
+    prepared: Vec<Vec<f32>>,
     workers: Vec<Worker>,
     capacity: usize,
 }
 
 #[derive(Clone, Debug)]
 struct Worker {
-    buffers: [Vec<f32>; 2],
+    /// Input and output of a stage for one image.
+    image: [Vec<f32>; 2],
+    /// What goes into the first dense layer.
+    rows: Vec<f32>,
+    /// Input and output of a stage for a group.
+    group: [Vec<f32>; 2],
     scratch: Vec<f32>,
 }
 
@@ -28,13 +44,27 @@ impl InferencePlan {
     /// larger batches are shared out over the rayon pool.
     pub fn new(network: &Network, capacity: usize) -> InferencePlan {
         let group = capacity.clamp(1, GROUP);
-        let largest = network.layers().iter().map(|l| l.layer.output().len()).max().unwrap_or(0);
-        let scratch = network.layers().iter().map(|l| l.layer.scratch_len(group)).max().unwrap_or(0);
+        let stages = stages(network);
+        let is_dense = |stage: &Stage| matches!(network.layers()[stage.layers.start].spec, LayerSpec::Dense { .. });
+        let maps = stages.iter().position(is_dense).unwrap_or(stages.len());
+        let largest = |stages: &[Stage]| stages.iter().map(|stage| stage.output_len(network)).max().unwrap_or(0);
+        let between = stages[..maps].last().map_or(0, |stage| stage.output_len(network));
+        let (image, after) = (largest(&stages[..maps]), group * largest(&stages[maps..]));
+        let scratch = stages.iter().map(|stage| stage.scratch_len(network, group)).max().unwrap_or(0);
         let worker = || Worker {
-            buffers: [vec![0.0; group * largest], vec![0.0; group * largest]],
+            image: [vec![0.0; image], vec![0.0; image]],
+            rows: vec![0.0; group * between],
+            group: [vec![0.0; after], vec![0.0; after]],
             scratch: vec![0.0; scratch],
         };
-        InferencePlan { workers: (0..capacity.div_ceil(group)).map(|_| worker()).collect(), capacity }
+        let prepared_len = |stage: &Stage| stage.prepared(network).map_or(0, |prepared| prepared.prepared_len());
+        InferencePlan {
+            prepared: stages.iter().map(|stage| vec![0.0; prepared_len(stage)]).collect(),
+            workers: (0..capacity.div_ceil(group)).map(|_| worker()).collect(),
+            stages,
+            maps,
+            capacity,
+        }
     }
 
     /// Runs the network on `x`, `[n][c][h][w]`, and fills `y`, `[n][outputs]`. An image's output does not depend on the
@@ -44,43 +74,104 @@ impl InferencePlan {
     ///
     /// Panics if the batch is larger than planned or the lengths do not fit the network.
     pub fn run(&mut self, network: &Network, parameters: &Parameters, x: &[f32], y: &mut [f32]) {
+        self.prepare(network, parameters);
+        self.run_prepared(network, parameters, x, y);
+    }
+
+    /// Puts the parameters in the order in which they are read: once, before many calls of
+    /// [`run_prepared`](InferencePlan::run_prepared) with few images each.
+    pub fn prepare(&mut self, network: &Network, parameters: &Parameters) {
+        for (stage, to) in self.stages.iter().zip(&mut self.prepared) {
+            if let Some(prepared) = stage.prepared(network) {
+                prepared.prepare(&parameters.values[stage.params(network)], to);
+            }
+        }
+    }
+
+    /// As [`run`](InferencePlan::run), with the parameters that [`prepare`](InferencePlan::prepare) has last been given.
+    ///
+    /// # Panics
+    ///
+    /// As [`run`](InferencePlan::run).
+    pub fn run_prepared(&mut self, network: &Network, parameters: &Parameters, x: &[f32], y: &mut [f32]) {
         let (input, output) = (network.input().len(), network.output().len());
         let n = x.len() / input;
         assert!(n <= self.capacity, "a batch of {n} images in a plan for {}", self.capacity);
         assert_eq!((x.len(), y.len()), (n * input, n * output));
-        let groups = x.chunks(GROUP * input).zip(y.chunks_mut(GROUP * output)).zip(&mut self.workers);
+        let InferencePlan { stages, maps, prepared, workers, .. } = self;
+        let run = Run { network, parameters, stages, maps: *maps, prepared };
         if n <= GROUP {
-            for ((x, y), worker) in groups {
-                worker.run(network, parameters, x, y);
+            for ((x, y), worker) in x.chunks(GROUP * input).zip(y.chunks_mut(GROUP * output)).zip(workers) {
+                run.group(worker, x, y);
             }
         } else {
             x.par_chunks(GROUP * input)
                 .zip(y.par_chunks_mut(GROUP * output))
-                .zip(&mut self.workers)
-                .for_each(|((x, y), worker)| worker.run(network, parameters, x, y));
+                .zip(workers)
+                .for_each(|((x, y), worker)| run.group(worker, x, y));
         }
     }
 }
 
-impl Worker {
-    fn run(&mut self, network: &Network, parameters: &Parameters, x: &[f32], y: &mut [f32]) {
-        let n = x.len() / network.input().len();
-        let [current, next] = &mut self.buffers;
-        let mut in_buffer = false;
-        for named in network.layers() {
-            let layer = &named.layer;
-            if layer.is_view() {
-                continue;
+/// What all workers share.
+#[derive(Clone, Copy)]
+struct Run<'a> {
+    network: &'a Network,
+    parameters: &'a Parameters,
+    stages: &'a [Stage],
+    maps: usize,
+    prepared: &'a [Vec<f32>],
+}
+
+impl Run<'_> {
+    fn group(&self, worker: &mut Worker, x: &[f32], y: &mut [f32]) {
+        let Worker { image, rows, group, scratch } = worker;
+        let input = self.network.input().len();
+        let n = x.len() / input;
+        let mut x = x;
+        if let Some(last) = self.stages[..self.maps].last() {
+            let rows = &mut rows[..n * last.output_len(self.network)];
+            for (x, row) in x.chunks_exact(input).zip(rows.chunks_exact_mut(last.output_len(self.network))) {
+                row.copy_from_slice(self.run(0..self.maps, 1, x, image, scratch));
             }
-            let input = if in_buffer { &current[..n * layer.input().len()] } else { x };
-            let params = &parameters.values[named.params.clone()];
-            let statistics = &parameters.statistics[named.statistics.clone()];
-            let output = &mut next[..n * layer.output().len()];
-            layer.infer(params, statistics, n, input, output, &mut self.scratch);
-            std::mem::swap(current, next);
-            in_buffer = true;
+            x = rows;
         }
-        y.copy_from_slice(if in_buffer { &current[..y.len()] } else { x });
+        y.copy_from_slice(self.run(self.maps..self.stages.len(), n, x, group, scratch));
+    }
+
+    /// The output of the last of `stages` for `n` images, which lies in one of the buffers; of no stages, `x`.
+    fn run<'b>(
+        &self,
+        stages: Range<usize>,
+        n: usize,
+        x: &'b [f32],
+        buffers: &'b mut [Vec<f32>; 2],
+        scratch: &mut [f32],
+    ) -> &'b [f32] {
+        let [current, next] = buffers;
+        let mut len = None;
+        for index in stages {
+            let stage = &self.stages[index];
+            let input = len.map_or(x, |len| &current[..len]);
+            let output = n * stage.output_len(self.network);
+            self.stage(index, n, input, &mut next[..output], scratch);
+            std::mem::swap(current, next);
+            len = Some(output);
+        }
+        len.map_or(x, |len| &current[..len])
+    }
+
+    fn stage(&self, index: usize, n: usize, x: &[f32], y: &mut [f32], scratch: &mut [f32]) {
+        let stage = &self.stages[index];
+        let first = &self.network.layers()[stage.layers.start];
+        let params = &self.parameters.values[stage.params(self.network)];
+        let statistics = &self.parameters.statistics[first.statistics.clone()];
+        match (&stage.kind, stage.prepared(self.network)) {
+            (Kind::Layer, Some(layer)) => layer.infer_prepared(&self.prepared[index], n, x, y, scratch),
+            (Kind::Layer, None) => first.layer.infer(params, statistics, n, x, y, scratch),
+            (Kind::NormRectify(fused), _) => fused.infer(params, statistics, n, x, y, scratch),
+            (Kind::PooledConv(fused), _) => fused.infer(params, n, x, y, scratch),
+        }
     }
 }
 

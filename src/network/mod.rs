@@ -4,13 +4,16 @@
 //! pass. A plan borrows the parameters for the length of a call: shared to infer, so evaluation cannot change them.
 
 mod inference;
+mod observation;
 mod spec;
+mod stages;
 mod training;
 
 use std::fmt::Write as _;
 use std::ops::Range;
 
 pub use inference::InferencePlan;
+pub use observation::ObservationPlan;
 pub use spec::LayerSpec;
 use steersman_kernels::Isa;
 pub(crate) use training::CHUNK;

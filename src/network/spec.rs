@@ -4,8 +4,8 @@ use serde::{Deserialize, Serialize};
 use steersman_kernels::Isa;
 
 use crate::layers::{
-    AveragePool, BatchNorm, Conv2d, Crop, Dense, Dropout, Elu, Flatten, Layer, MaxPool, PRelu, Padding, Relu, Scale,
-    Slopes,
+    AveragePool, BatchNorm, Conv2d, Crop, Dense, Dropout, Elu, Flatten, Layer, LeakyRelu, MaxPool, PRelu, Padding,
+    Relu, Scale, Slopes, Softsign, Tanh, ZeroPad,
 };
 use crate::tensor::{Initializer, Shape};
 
@@ -54,6 +54,15 @@ pub enum LayerSpec {
         #[serde(default = "one")]
         alpha: f32,
     },
+    /// [`LeakyRelu`].
+    LeakyRelu {
+        /// Slope below zero.
+        slope: f32,
+    },
+    /// [`Tanh`].
+    Tanh {},
+    /// [`Softsign`].
+    Softsign {},
     /// [`PRelu`].
     #[serde(rename = "prelu")]
     PRelu {
@@ -111,6 +120,15 @@ pub enum LayerSpec {
         #[serde(default)]
         columns: [usize; 2],
     },
+    /// [`ZeroPad`].
+    ZeroPad {
+        /// Rows added at the top and at the bottom.
+        #[serde(default)]
+        rows: [usize; 2],
+        /// Columns added on the left and on the right.
+        #[serde(default)]
+        columns: [usize; 2],
+    },
 }
 
 fn one() -> f32 {
@@ -141,6 +159,9 @@ impl LayerSpec {
             LayerSpec::BatchNorm { .. } => "bn",
             LayerSpec::Relu {} => "relu",
             LayerSpec::Elu { .. } => "elu",
+            LayerSpec::LeakyRelu { .. } => "leaky_relu",
+            LayerSpec::Tanh {} => "tanh",
+            LayerSpec::Softsign {} => "softsign",
             LayerSpec::PRelu { .. } => "prelu",
             LayerSpec::MaxPool { .. } | LayerSpec::AveragePool { .. } => "pool",
             LayerSpec::Dropout { .. } => "dropout",
@@ -148,6 +169,7 @@ impl LayerSpec {
             LayerSpec::Dense { .. } => "dense",
             LayerSpec::Scale { .. } => "scale",
             LayerSpec::Crop { .. } => "crop",
+            LayerSpec::ZeroPad { .. } => "pad",
         }
     }
 
@@ -168,6 +190,9 @@ impl LayerSpec {
             LayerSpec::Relu {} => "ReLU".into(),
             LayerSpec::Elu { alpha: 1.0 } => "ELU".into(),
             LayerSpec::Elu { alpha } => format!("ELU alpha {alpha}"),
+            LayerSpec::LeakyRelu { slope } => format!("leaky ReLU {slope}"),
+            LayerSpec::Tanh {} => "tanh".into(),
+            LayerSpec::Softsign {} => "softsign".into(),
             LayerSpec::PRelu { slopes: Slopes::PerPosition, .. } => "PReLU".into(),
             LayerSpec::PRelu { slopes: Slopes::PerChannel, .. } => "PReLU per channel".into(),
             LayerSpec::MaxPool { window, stride } => {
@@ -181,6 +206,7 @@ impl LayerSpec {
             LayerSpec::Dense { .. } => "dense".into(),
             LayerSpec::Scale { factor, offset } => format!("x * {factor} + {offset}").replace("+ -", "- "),
             LayerSpec::Crop { .. } => "crop".into(),
+            LayerSpec::ZeroPad { .. } => "zero padding".into(),
         }
     }
 
@@ -207,6 +233,14 @@ impl LayerSpec {
             }
             LayerSpec::Crop { rows, columns } => {
                 [rows, columns].concat().into_iter().map(|size| ("rows and columns", size)).collect()
+            }
+            LayerSpec::ZeroPad { rows, columns } => {
+                let sum = |inside: usize, border: [usize; 2]| border.iter().fold(inside, |a, b| a.saturating_add(*b));
+                let outputs = sum(input.h, rows).saturating_mul(sum(input.w, columns)).saturating_mul(input.c);
+                if outputs > MAX_NUMBERS {
+                    return Err(format!("the padded map would have more than {MAX_NUMBERS} numbers"));
+                }
+                vec![]
             }
             _ => vec![],
         };
@@ -240,6 +274,9 @@ impl LayerSpec {
             }
             LayerSpec::Relu {} => Box::new(Relu::new(input, isa)),
             LayerSpec::Elu { alpha } => Box::new(Elu::new(input, alpha, isa)?),
+            LayerSpec::LeakyRelu { slope } => Box::new(LeakyRelu::new(input, slope, isa)?),
+            LayerSpec::Tanh {} => Box::new(Tanh::new(input, isa)),
+            LayerSpec::Softsign {} => Box::new(Softsign::new(input, isa)),
             LayerSpec::PRelu { slopes, initial_slope } => Box::new(PRelu::new(input, slopes, initial_slope, isa)),
             LayerSpec::MaxPool { window, stride } => {
                 Box::new(MaxPool::new(input, window, stride.unwrap_or(window), isa)?)
@@ -252,6 +289,7 @@ impl LayerSpec {
             LayerSpec::Dense { units, init } => Box::new(Dense::new(input, units, init, isa)?),
             LayerSpec::Scale { factor, offset } => Box::new(Scale::new(input, factor, offset)?),
             LayerSpec::Crop { rows, columns } => Box::new(Crop::new(input, rows, columns)?),
+            LayerSpec::ZeroPad { rows, columns } => Box::new(ZeroPad::new(input, rows, columns)),
         })
     }
 }

@@ -12,7 +12,8 @@ use std::ops::Range;
 use rayon::prelude::*;
 use steersman_kernels::{Isa, update};
 
-use super::{NamedLayer, Network, Parameters};
+use super::stages::{Kind, Stage, stages};
+use super::{Network, Parameters};
 use crate::layers::{BatchStatistics, Grads, Pair, Pass};
 use crate::loss::Loss;
 
@@ -49,15 +50,14 @@ pub struct TrainingPlan {
     gradient: Vec<f32>,
     /// Sum of squares of each chunk of the gradient.
     chunk_squares: Vec<f64>,
-    /// What the barriers found out about the batch, all layers one after the other.
+    stages: Vec<Stage>,
+    /// What the barriers found out about the batch, all stages one after the other.
     moments: Vec<f32>,
-    /// Where each layer's part of `moments` lies.
+    /// Where each stage's part of `moments` lies.
     moments_of: Vec<Range<usize>>,
     sums: Vec<f64>,
-    /// Runs of layers without a barrier inside; each but the first begins with the layer that needs the barrier.
+    /// Runs of stages without a barrier inside; each but the first begins with the stage that needs the barrier.
     segments: Vec<Range<usize>>,
-    /// For each layer, which earlier layer's output is its input; `None` is the batch itself.
-    source: Vec<Option<usize>>,
     capacity: usize,
     isa: Isa,
 }
@@ -66,11 +66,15 @@ pub struct TrainingPlan {
 struct Shard {
     /// Which images of the batch.
     images: Range<usize>,
-    /// Output of each layer; empty for views.
+    /// Output of each stage.
     activations: Vec<Vec<f32>>,
-    /// Gradient with respect to the current layer's output, and to its input.
+    /// Where each [`Kind::PooledConv`] found its largest; empty for the others.
+    places: Vec<Vec<u32>>,
+    /// Gradient with respect to the current stage's output, and to its input.
     d_output: Vec<f32>,
     d_input: Vec<f32>,
+    /// Whether the gradient with respect to the current stage's output has taken the place of that output instead.
+    in_place: bool,
     gradient: Vec<f32>,
     sums: Vec<f64>,
     scratch: Vec<f32>,
@@ -81,12 +85,15 @@ struct Shard {
 impl TrainingPlan {
     /// Buffers for batches of up to `capacity` images.
     pub fn new(network: &Network, capacity: usize) -> TrainingPlan {
-        let layers = network.layers();
+        TrainingPlan::with_stages(network, capacity, stages(network))
+    }
+
+    pub(super) fn with_stages(network: &Network, capacity: usize, stages: Vec<Stage>) -> TrainingPlan {
         let mut moments_of = Vec::new();
         let mut segment_starts = vec![0];
         let (mut moments_end, mut sums_len) = (0, 0);
-        for (index, layer) in layers.iter().enumerate() {
-            let barrier = layer.layer.batch_statistics();
+        for (index, stage) in stages.iter().enumerate() {
+            let barrier = stage.barrier(network);
             let len = barrier.map_or(0, BatchStatistics::moments_len);
             moments_of.push(moments_end..moments_end + len);
             moments_end += len;
@@ -96,14 +103,14 @@ impl TrainingPlan {
             }
         }
         // A network that begins with a barrier has an empty first segment, which only takes the sums of the input.
-        let ends = segment_starts[1..].iter().copied().chain([layers.len()]);
+        let ends = segment_starts[1..].iter().copied().chain([stages.len()]);
         let segments: Vec<_> = segment_starts.iter().copied().zip(ends).map(|(start, end)| start..end).collect();
 
-        let source: Vec<Option<usize>> =
-            (0..layers.len()).map(|i| (0..i).rev().find(|&j| !is_view(&layers[j]))).collect();
-        let activations_len = |layer: &NamedLayer| if is_view(layer) { 0 } else { layer.layer.output().len() };
-        let per_image: usize = layers.iter().map(activations_len).sum();
-        let largest = layers.iter().map(|l| l.layer.input().len().max(l.layer.output().len())).max().unwrap_or(0);
+        let per_image: usize = stages.iter().map(|stage| stage.output_len(network)).sum();
+        // What is not put in the place of an activation: the gradient of the last output, and of the inputs of the others.
+        let gradients = stages.iter().enumerate().filter(|(index, _)| !replaces_input(network, &stages, *index));
+        let largest = gradients.map(|(_, stage)| stage.input_len(network)).chain([network.output().len()]).max();
+        let largest = largest.unwrap_or(0);
 
         let shard_capacity = capacity.div_ceil(MAX_SHARDS).max(1);
         let group = if segments.len() > 1 {
@@ -111,13 +118,15 @@ impl TrainingPlan {
         } else {
             (GROUP_NUMBERS / per_image.max(1)).clamp(MIN_GROUP.min(shard_capacity), shard_capacity)
         };
-        let scratch_len = layers.iter().map(|l| l.layer.scratch_len(group)).max().unwrap_or(0);
+        let scratch_len = stages.iter().map(|stage| stage.scratch_len(network, group)).max().unwrap_or(0);
         let shards = (0..capacity.min(MAX_SHARDS))
             .map(|_| Shard {
                 images: 0..0,
-                activations: layers.iter().map(|l| vec![0.0; group * activations_len(l)]).collect(),
+                activations: stages.iter().map(|stage| vec![0.0; group * stage.output_len(network)]).collect(),
+                places: stages.iter().map(|stage| vec![0; stage.places_len(network) * group]).collect(),
                 d_output: vec![0.0; group * largest],
                 d_input: vec![0.0; group * largest],
+                in_place: false,
                 gradient: vec![0.0; network.count(true)],
                 sums: vec![0.0; sums_len],
                 scratch: vec![0.0; scratch_len],
@@ -128,11 +137,11 @@ impl TrainingPlan {
             shards,
             gradient: vec![0.0; network.count(true)],
             chunk_squares: vec![0.0; network.count(true).div_ceil(CHUNK)],
+            stages,
             moments: vec![0.0; moments_end],
             moments_of,
             sums: vec![0.0; sums_len],
             segments,
-            source,
             capacity,
             isa: network.isa(),
         }
@@ -164,7 +173,8 @@ impl TrainingPlan {
         assert!(n > 0 && n <= self.capacity, "a batch of {n} images in a plan for 1 to {}", self.capacity);
         assert_eq!(input.x.len(), n * network.input().len());
         assert_eq!(input.labels.len(), n * network.output().len());
-        assert_eq!(network.layers().len(), self.source.len());
+        let planned = self.stages.last().map_or(0, |stage| stage.layers.end);
+        assert!(network.layers()[planned..].iter().all(|layer| layer.layer.is_view()), "a plan for another network");
 
         let shard_images = n.div_ceil(MAX_SHARDS);
         let used = n.div_ceil(shard_images);
@@ -188,16 +198,16 @@ impl TrainingPlan {
         input: StepInput,
         used: usize,
     ) {
-        let TrainingPlan { shards, source, .. } = self;
-        let run = Run { network, parameters, source, moments: &[], moments_of: &[], input };
+        let TrainingPlan { shards, stages, .. } = self;
+        let run = Run { network, parameters, stages, moments: &[], moments_of: &[], input };
         shards[..used].par_iter_mut().for_each(|shard| {
             shard.reset();
             let group = shard.group_capacity(network);
             for start in shard.images.clone().step_by(group) {
                 let images = start..(start + group).min(shard.images.end);
-                run.forward(0..network.layers().len(), shard, images.clone());
+                run.forward(0..stages.len(), shard, images.clone());
                 run.loss(loss, shard, images.clone());
-                run.backward(0..network.layers().len(), shard, images);
+                run.backward(0..stages.len(), shard, images);
             }
         });
     }
@@ -210,14 +220,16 @@ impl TrainingPlan {
         input: StepInput,
         used: usize,
     ) {
-        let TrainingPlan { shards, moments, moments_of, sums, segments, source, .. } = self;
+        let TrainingPlan { shards, stages, moments, moments_of, sums, segments, .. } = self;
         let shards = &mut shards[..used];
         let images = shards.last().map_or(0, |shard| shard.images.end);
-        let layers = network.layers();
+        let barrier = |stage: usize| {
+            stages[stage].barrier(network).expect("segments begin with a stage that has batch statistics")
+        };
         let last = segments.len() - 1;
 
         for (index, segment) in segments.iter().enumerate() {
-            let run = Run { network, parameters, source, moments, moments_of, input };
+            let run = Run { network, parameters, stages, moments, moments_of, input };
             let next_barrier = segments.get(index + 1).map(|next| next.start);
             shards.par_iter_mut().for_each(|shard| {
                 if index == 0 {
@@ -225,42 +237,42 @@ impl TrainingPlan {
                 }
                 run.forward(segment.clone(), shard, shard.images.clone());
                 match next_barrier {
-                    Some(layer) => run.forward_sums(layer, shard),
+                    Some(stage) => run.forward_sums(stage, barrier(stage), shard),
                     None => run.loss(loss, shard, shard.images.clone()),
                 }
             });
-            if let Some(layer) = next_barrier {
-                let NamedLayer { params, statistics, .. } = &layers[layer];
-                let sums = total(shards, barrier(&layers[layer]).sums_len(), sums);
-                barrier(&layers[layer]).finish_forward(
-                    &parameters.values[params.clone()],
+            if let Some(stage) = next_barrier {
+                let layer = &network.layers()[stages[stage].layers.start];
+                let sums = total(shards, barrier(stage).sums_len(), sums);
+                barrier(stage).finish_forward(
+                    &parameters.values[layer.params.clone()],
                     images,
                     sums,
-                    &mut moments[moments_of[layer].clone()],
-                    &mut parameters.statistics[statistics.clone()],
+                    &mut moments[moments_of[stage].clone()],
+                    &mut parameters.statistics[layer.statistics.clone()],
                 );
             }
         }
         for (index, segment) in segments.iter().enumerate().rev() {
-            let run = Run { network, parameters, source, moments, moments_of, input };
-            // The layer at the start of a segment waits for the sums over all shards.
+            let run = Run { network, parameters, stages, moments, moments_of, input };
+            // The stage at the start of a segment waits for the sums over all shards.
             let rest = if index > 0 { segment.start + 1..segment.end } else { segment.clone() };
             shards.par_iter_mut().for_each(|shard| {
                 if index < last {
-                    let barrier_layer = segments[index + 1].start;
-                    run.backward(barrier_layer..barrier_layer + 1, shard, shard.images.clone());
+                    let next = segments[index + 1].start;
+                    run.backward(next..next + 1, shard, shard.images.clone());
                 }
                 run.backward(rest.clone(), shard, shard.images.clone());
                 if index > 0 {
-                    run.backward_sums(segment.start, shard);
+                    run.backward_sums(segment.start, barrier(segment.start), shard);
                 }
             });
             if index > 0 {
-                let layer = segment.start;
-                let sums = total(shards, barrier(&layers[layer]).sums_len(), sums);
-                let params = &parameters.values[layers[layer].params.clone()];
-                let moments = &mut moments[moments_of[layer].clone()];
-                barrier(&layers[layer]).finish_backward(params, images, sums, moments);
+                let stage = segment.start;
+                let sums = total(shards, barrier(stage).sums_len(), sums);
+                let params = &parameters.values[network.layers()[stages[stage].layers.start].params.clone()];
+                let moments = &mut moments[moments_of[stage].clone()];
+                barrier(stage).finish_backward(params, images, sums, moments);
             }
         }
     }
@@ -290,17 +302,27 @@ impl Shard {
 
     /// How many images the activations have room for.
     fn group_capacity(&self, network: &Network) -> usize {
-        let last = network.layers().iter().rposition(|layer| !is_view(layer)).expect("a planned network has a layer");
-        self.activations[last].len() / network.output().len()
+        self.activations.last().map_or(self.images.len(), |last| last.len() / network.output().len()).max(1)
+    }
+
+    /// Output of stage `stage` and of its source, which comes before it.
+    fn source_and_output(&mut self, stage: usize, source: usize) -> (&mut [f32], &mut [f32]) {
+        let (before, from_here) = self.activations.split_at_mut(stage);
+        (&mut before[source], &mut from_here[0])
     }
 }
 
-fn is_view(layer: &NamedLayer) -> bool {
-    layer.layer.is_view()
-}
-
-fn barrier(layer: &NamedLayer) -> &dyn BatchStatistics {
-    layer.layer.batch_statistics().expect("segments begin with a layer that has batch statistics")
+/// Whether the gradient of the stage's input takes the place of that input.
+fn replaces_input(network: &Network, stages: &[Stage], index: usize) -> bool {
+    let Some(source) = stages[index].source else { return false };
+    match &stages[index].kind {
+        Kind::NormRectify(_) => true,
+        Kind::PooledConv(_) => false,
+        Kind::Layer => {
+            let layer = &network.layers()[stages[index].layers.start].layer;
+            layer.linear().is_some() && stages[source].forgets_output(network)
+        }
+    }
 }
 
 /// Adds the shards' sums up, in their order.
@@ -320,96 +342,136 @@ fn total<'a>(shards: &[Shard], len: usize, sums: &'a mut [f64]) -> &'a [f64] {
 struct Run<'a> {
     network: &'a Network,
     parameters: &'a Parameters,
-    source: &'a [Option<usize>],
+    stages: &'a [Stage],
     moments: &'a [f32],
     moments_of: &'a [Range<usize>],
     input: StepInput<'a>,
 }
 
 impl<'a> Run<'a> {
-    fn pass(&self, layer: usize, first_image: usize) -> Pass<'a> {
-        let moments = self.moments_of.get(layer).map_or(&[][..], |range| &self.moments[range.clone()]);
+    fn pass(&self, stage: usize, first_image: usize) -> Pass<'a> {
+        let moments = self.moments_of.get(stage).map_or(&[][..], |range| &self.moments[range.clone()]);
+        let layer = self.stages[stage].layers.start;
         Pass { seed: self.input.seed, step: self.input.step, layer, first_image, moments }
     }
 
-    fn params(&self, layer: usize) -> &'a [f32] {
-        &self.parameters.values[self.network.layers()[layer].params.clone()]
+    fn params(&self, stage: usize) -> &'a [f32] {
+        &self.parameters.values[self.stages[stage].params(self.network)]
     }
 
-    /// The input of `layer` for `images` of the batch.
-    fn layer_input<'b>(&self, layer: usize, activations: &'b [Vec<f32>], images: Range<usize>) -> &'b [f32]
+    /// The input of `stage` for `images` of the batch.
+    fn stage_input<'b>(&self, stage: usize, activations: &'b [Vec<f32>], images: Range<usize>) -> &'b [f32]
     where
         'a: 'b,
     {
-        let len = self.network.layers()[layer].layer.input().len();
-        match self.source[layer] {
+        let len = self.stages[stage].input_len(self.network);
+        match self.stages[stage].source {
             Some(source) => &activations[source][..images.len() * len],
             None => &self.input.x[images.start * len..images.end * len],
         }
     }
 
-    fn forward(&self, layers: Range<usize>, shard: &mut Shard, images: Range<usize>) {
-        for index in layers {
-            let layer = &self.network.layers()[index].layer;
-            if layer.is_view() {
-                continue;
-            }
+    fn forward(&self, stages: Range<usize>, shard: &mut Shard, images: Range<usize>) {
+        for index in stages {
+            let stage = &self.stages[index];
             let (before, from_here) = shard.activations.split_at_mut(index);
-            let x = self.layer_input(index, before, images.clone());
-            let y = &mut from_here[0][..images.len() * layer.output().len()];
-            let pass = self.pass(index, images.start);
-            layer.forward(self.params(index), &pass, images.len(), x, y, &mut shard.scratch);
+            let x = self.stage_input(index, before, images.clone());
+            let n = images.len();
+            let y = &mut from_here[0][..n * stage.output_len(self.network)];
+            let (params, pass) = (self.params(index), self.pass(index, images.start));
+            match &stage.kind {
+                Kind::Layer => {
+                    let layer = &self.network.layers()[stage.layers.start].layer;
+                    layer.forward(params, &pass, n, x, y, &mut shard.scratch);
+                }
+                Kind::NormRectify(fused) => fused.forward(params, &pass, n, x, y),
+                Kind::PooledConv(fused) => {
+                    let places = &mut shard.places[index][..y.len()];
+                    fused.forward(params, n, x, y, places, &mut shard.scratch);
+                }
+            }
         }
     }
 
     /// Adds the images' losses to the shard's, and puts the gradient of the mean loss into `d_output`.
     fn loss(&self, loss: &Loss, shard: &mut Shard, images: Range<usize>) {
         let outputs = self.network.output().len();
-        let after_last = self.network.layers().len();
-        let last = (0..after_last).rev().find(|&i| !self.network.layers()[i].layer.is_view());
-        let predictions = match last {
-            Some(last) => &shard.activations[last][..images.len() * outputs],
+        let predictions = match shard.activations.last() {
+            Some(last) => &last[..images.len() * outputs],
             None => &self.input.x[images.start * outputs..images.end * outputs],
         };
         let labels = &self.input.labels[images.start * outputs..images.end * outputs];
         let scale = 1.0 / self.input.labels.len() as f32;
         shard.loss += loss.value_and_gradient(predictions, labels, scale, &mut shard.d_output[..predictions.len()]);
+        shard.in_place = false;
     }
 
-    /// Takes `d_output` of the last of `layers` back to the input of the first.
-    fn backward(&self, layers: Range<usize>, shard: &mut Shard, images: Range<usize>) {
-        for index in layers.rev() {
-            let layer = &self.network.layers()[index].layer;
-            if layer.is_view() {
-                continue;
-            }
+    /// Takes the gradient of the output of the last of `stages` back to the input of the first.
+    fn backward(&self, stages: Range<usize>, shard: &mut Shard, images: Range<usize>) {
+        for index in stages.rev() {
+            let stage = &self.stages[index];
             let n = images.len();
-            let (x_len, y_len) = (n * layer.input().len(), n * layer.output().len());
-            let x = self.layer_input(index, &shard.activations, images.clone());
-            let pair = Pair { x, y: &shard.activations[index][..y_len], dy: &shard.d_output[..y_len] };
-            // Nobody asks for the gradient of the images themselves.
-            let dx = self.source[index].map(|_| &mut shard.d_input[..x_len]);
-            let range = self.network.layers()[index].params.clone();
-            let grads = Grads { dparams: &mut shard.gradient[range], scratch: &mut shard.scratch };
-            layer.backward(self.params(index), &self.pass(index, images.start), n, pair, dx, grads);
-            std::mem::swap(&mut shard.d_output, &mut shard.d_input);
+            let (x_len, y_len) = (n * stage.input_len(self.network), n * stage.output_len(self.network));
+            let (params, pass) = (self.params(index), self.pass(index, images.start));
+            let replaces = stage.source.filter(|_| replaces_input(self.network, self.stages, index));
+            match &stage.kind {
+                Kind::NormRectify(fused) => {
+                    let source = replaces.expect("batch norm runs fused only after another stage");
+                    let (in_place, d_output) = (shard.in_place, std::mem::take(&mut shard.d_output));
+                    let (x, y) = shard.source_and_output(index, source);
+                    let dy = if in_place { &y[..y_len] } else { &d_output[..y_len] };
+                    fused.backward(params, &pass, n, &mut x[..x_len], dy);
+                    shard.d_output = d_output;
+                }
+                Kind::PooledConv(fused) => {
+                    let x = self.stage_input(index, &shard.activations, images.clone());
+                    let pair = Pair { x, y: &shard.activations[index][..y_len], dy: &shard.d_output[..y_len] };
+                    let dx = stage.source.map(|_| &mut shard.d_input[..x_len]);
+                    let dparams = &mut shard.gradient[stage.params(self.network)];
+                    let grads = Grads { dparams, scratch: &mut shard.scratch };
+                    fused.backward(params, n, pair, &shard.places[index][..y_len], dx, grads);
+                }
+                Kind::Layer => {
+                    let layer = &self.network.layers()[stage.layers.start].layer;
+                    let x = self.stage_input(index, &shard.activations, images.clone());
+                    let y = &shard.activations[index][..y_len];
+                    let pair = Pair { x, y, dy: if shard.in_place { y } else { &shard.d_output[..y_len] } };
+                    // Nobody asks for the gradient of the images themselves.
+                    let apart = stage.source.is_some() && replaces.is_none();
+                    let dx = if apart { Some(&mut shard.d_input[..x_len]) } else { None };
+                    let dparams = &mut shard.gradient[stage.params(self.network)];
+                    layer.backward(params, &pass, n, pair, dx, Grads { dparams, scratch: &mut shard.scratch });
+                    if let (Some(linear), Some(source)) = (layer.linear(), replaces) {
+                        let (before, from_here) = shard.activations.split_at_mut(index);
+                        let dy = if shard.in_place { &from_here[0][..y_len] } else { &shard.d_output[..y_len] };
+                        linear.backward_input(params, n, dy, &mut before[source][..x_len], &mut shard.scratch);
+                    }
+                }
+            }
+            shard.in_place = replaces.is_some();
+            if !shard.in_place {
+                std::mem::swap(&mut shard.d_output, &mut shard.d_input);
+            }
         }
     }
 
-    fn forward_sums(&self, layer: usize, shard: &mut Shard) {
-        let barrier = barrier(&self.network.layers()[layer]);
-        let x = self.layer_input(layer, &shard.activations, shard.images.clone());
+    fn forward_sums(&self, stage: usize, barrier: &dyn BatchStatistics, shard: &mut Shard) {
+        let x = self.stage_input(stage, &shard.activations, shard.images.clone());
         barrier.forward_sums(shard.images.len(), x, &mut shard.sums[..barrier.sums_len()]);
     }
 
-    fn backward_sums(&self, layer: usize, shard: &mut Shard) {
-        let named = &self.network.layers()[layer];
-        let barrier = barrier(named);
+    fn backward_sums(&self, index: usize, barrier: &dyn BatchStatistics, shard: &mut Shard) {
+        let stage = &self.stages[index];
         let n = shard.images.len();
-        let x = self.layer_input(layer, &shard.activations, shard.images.clone());
-        let dy = &shard.d_output[..n * named.layer.output().len()];
+        let x = self.stage_input(index, &shard.activations, shard.images.clone());
+        let y_len = n * stage.output_len(self.network);
+        let dy = if shard.in_place { &shard.activations[index][..y_len] } else { &shard.d_output[..y_len] };
         let sums = &mut shard.sums[..barrier.sums_len()];
-        let dparams = &mut shard.gradient[named.params.clone()];
-        barrier.backward_sums(self.pass(layer, shard.images.start).moments, n, x, dy, sums, dparams);
+        let moments = self.pass(index, shard.images.start).moments;
+        let dparams = &mut shard.gradient[stage.params(self.network)];
+        match &stage.kind {
+            Kind::Layer | Kind::PooledConv(_) => barrier.backward_sums(moments, n, x, dy, sums, dparams),
+            Kind::NormRectify(fused) => fused.backward_sums(self.params(index), moments, n, x, dy, sums, dparams),
+        }
     }
 }

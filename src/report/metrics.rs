@@ -39,6 +39,8 @@ pub struct Metrics {
     pub bias_deg: f64,
     /// Share of the labels' variance that is explained: 1 − squared errors / squared deviations from the mean label.
     pub r2: Option<f64>,
+    /// Pearson's correlation of predictions and labels: how well their ups and downs agree, whatever their scale.
+    pub correlation: Option<f64>,
     /// Mean squared error ÷ mean squared label: 1 is as good as always predicting zero, smaller is better.
     pub relative_to_zero: Option<f64>,
     /// Root of the mean squared change of the predicted angle per second, between neighbouring rows of a session.
@@ -79,10 +81,24 @@ impl Metrics {
             mae_right_deg: mae_where(&|angle_deg| angle_deg >= STRAIGHT_DEG),
             bias_deg: mean(&mut errors()) * full_lock_deg,
             r2: (label_variance > 0.0).then(|| 1.0 - mse / label_variance),
+            correlation: correlation(predictions.iter().map(|p| (f64::from(p.steering), f64::from(p.label)))),
             relative_to_zero: (label_square > 0.0).then(|| mse / label_square),
             whiteness_deg_s: mean_of(&mut rates.map(|rate| rate * rate)).map(f64::sqrt),
         })
     }
+}
+
+/// Pearson's correlation of pairs; absent where one side is always the same, or there are no pairs.
+pub fn correlation(pairs: impl Iterator<Item = (f64, f64)> + Clone) -> Option<f64> {
+    let count = pairs.clone().count() as f64;
+    let (sum_a, sum_b) = pairs.clone().fold((0.0, 0.0), |(a, b), pair| (a + pair.0, b + pair.1));
+    let (mean_a, mean_b) = (sum_a / count, sum_b / count);
+    let [ab, aa, bb] = pairs.fold([0.0; 3], |[ab, aa, bb], (a, b)| {
+        let (a, b) = (a - mean_a, b - mean_b);
+        [ab + a * b, aa + a * a, bb + b * b]
+    });
+    // Also false for what is no number.
+    (aa > 0.0 && bb > 0.0).then(|| ab / (aa * bb).sqrt())
 }
 
 #[cfg(test)]
@@ -112,6 +128,10 @@ mod tests {
         assert_relative_eq!(m.relative_to_zero.unwrap(), 0.08 / squares, max_relative = 1e-6);
         let variance = squares / 4.0 - 0.005f64.powi(2);
         assert_relative_eq!(m.r2.unwrap(), 1.0 - 0.02 / variance, max_relative = 1e-6);
+        // Deviations from the means 0.055 and 0.005.
+        let products = (-0.255 * -0.405) + (-0.035 * 0.015) + (0.345 * 0.395) + (0.145 * -0.005);
+        let (a, b) = (0.065025 + 0.001225 + 0.119025 + 0.021025, 0.164025 + 0.000225 + 0.156025 + 0.000025);
+        assert_relative_eq!(m.correlation.unwrap(), products / (a * b as f64).sqrt(), max_relative = 1e-6);
         // 5.5° and 9.5° within 0.1 s each; the last row is another session.
         assert_relative_eq!(
             m.whiteness_deg_s.unwrap(),
@@ -125,5 +145,6 @@ mod tests {
         assert_eq!(Metrics::of(&[], 25.0), None);
         let m = Metrics::of(&predictions(&[(0.1, 0.0, 0, 0.0)]), 25.0).unwrap();
         assert_eq!((m.mae_left_deg, m.r2, m.relative_to_zero, m.whiteness_deg_s), (None, None, None, None));
+        assert_eq!(m.correlation, None);
     }
 }

@@ -1,6 +1,6 @@
 //! One client: its handshake, its messages, its deadlines.
 
-use std::io::{ErrorKind, Read, Write};
+use std::io::{Read, Write};
 use std::net::SocketAddr;
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, PoisonError};
@@ -22,7 +22,7 @@ use super::recording::Queued;
 use super::registry::{Peer, Stage};
 use super::seat::Claim;
 use super::server::Shared;
-use super::socket::Socket;
+use super::socket::{Socket, is_timeout};
 use super::tokens::Tokens;
 
 /// Largest message, bytes.
@@ -33,6 +33,8 @@ const MAX_IMAGE_SIDE: usize = 1920;
 const MAX_BATCH: usize = 16;
 /// Time for the whole request of a handshake.
 const HANDSHAKE_TIME: Duration = Duration::from_secs(5);
+/// Time that a client has to read the last words.
+const FAREWELL: Duration = Duration::from_millis(200);
 /// Time that an unknown client has for telemetry before it gets the handshake of Socket.IO.
 const GREETING_TIME: Duration = Duration::from_millis(50);
 /// Telemetry is stale after this time: the throttle is cut.
@@ -128,6 +130,7 @@ fn open<'a>(shared: &'a Shared, peer: &'a Arc<Peer>, address: SocketAddr) -> Res
                 show_request(shared, address, &head);
                 journal.step(format_args!("{address} < {}", response.lines().next().unwrap_or("")));
                 socket.write_all(response.as_bytes())?;
+                socket.finish(FAREWELL);
                 return Err(End::Fault(Event::Refused, format!("refused, {reason}")));
             }
             Verdict::Accept { response, head_len, client } => break (response, head_len, client),
@@ -163,7 +166,7 @@ fn open<'a>(shared: &'a Shared, peer: &'a Arc<Peer>, address: SocketAddr) -> Res
         websocket,
         tokens: Tokens::new(u32::from(client.is_simulator())),
         client,
-        greeting: Greeting::None,
+        greeted: false,
         opened: now,
         last_message: now,
         last_ping: now,
@@ -185,10 +188,6 @@ fn open<'a>(shared: &'a Shared, peer: &'a Arc<Peer>, address: SocketAddr) -> Res
     })
 }
 
-fn is_timeout(error: &std::io::Error) -> bool {
-    matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted)
-}
-
 fn show_request(shared: &Shared, address: SocketAddr, head: &[u8]) {
     if shared.journal.checks() {
         for line in String::from_utf8_lossy(head).lines().filter(|line| !line.is_empty()).take(20) {
@@ -198,20 +197,15 @@ fn show_request(shared: &Shared, address: SocketAddr, head: &[u8]) {
     }
 }
 
-/// How far the handshake of Socket.IO has come; the simulator does without.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Greeting {
-    None,
-    Opened,
-}
-
+/// A WebSocket and what is known of the client behind it.
 struct Connection<'a> {
     shared: &'a Shared<'a>,
     peer: &'a Arc<Peer>,
     address: SocketAddr,
     websocket: WebSocket<Socket>,
     client: Client,
-    greeting: Greeting,
+    /// Whether it got the handshake of Socket.IO; the simulator does without.
+    greeted: bool,
     opened: Instant,
     last_message: Instant,
     last_ping: Instant,
@@ -254,7 +248,7 @@ impl Connection<'_> {
             self.websocket.get_mut().begin_beat();
             let mut messages = 1;
             if let Some(message) = self.read()? {
-                let mut bytes = message.0.len();
+                let (mut bytes, mut end) = (message.0.len(), Ok(()));
                 batch.push(message);
                 // Whatever else is complete already: of several telemetries only the newest is answered.
                 self.websocket.get_mut().set_waiting(false)?;
@@ -265,40 +259,54 @@ impl Connection<'_> {
                             batch.push(message);
                         }
                         Ok(None) => break,
-                        // What came before it is still served; the next read meets the same end.
-                        Err(_) => break,
+                        // What came before it is still served.
+                        Err(error) => {
+                            end = Err(error);
+                            break;
+                        }
                     }
                 }
                 self.websocket.get_mut().set_waiting(true)?;
                 messages = batch.len();
                 self.take(&mut batch)?;
+                end?;
             }
             self.after_beat()?;
             let bytes = self.websocket.get_mut().take_count();
             if bytes > 0 && self.peer.stage() != Stage::Trusted {
-                std::thread::sleep(self.pace.charge(messages, bytes, Instant::now()));
+                self.rest(messages, bytes);
             }
+        }
+    }
+
+    /// Lets a stranger wait who has sent so much.
+    fn rest(&mut self, messages: usize, bytes: usize) {
+        /// Time in which it is noticed that the connection has to end.
+        const STEP: Duration = Duration::from_millis(5);
+        let now = Instant::now();
+        let until = now + self.pace.charge(messages, bytes, now);
+        while !self.shared.stop.load(Ordering::Relaxed) && !self.peer.is_closing() {
+            let left = until.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                return;
+            }
+            std::thread::sleep(left.min(STEP));
         }
     }
 
     /// The next complete text message; `None` if none has come within the beat.
     fn read(&mut self) -> Result<Option<(Utf8Bytes, Instant)>, End> {
-        loop {
-            match self.websocket.read() {
-                Ok(Message::Text(text)) => {
-                    self.last_message = Instant::now();
-                    return Ok(Some((text, self.websocket.get_ref().last_byte())));
-                }
-                Ok(Message::Close(_)) => return Err(End::Closed),
-                Ok(Message::Binary(_)) => {
-                    self.fault(Event::NotSocketIo, format_args!("a binary message"))?;
-                    return Ok(None);
-                }
-                // Answered by the next read. Returning lets deadlines be looked after, however many come.
-                Ok(_) => return Ok(None),
-                Err(tungstenite::Error::Io(error)) if is_timeout(&error) => return Ok(None),
-                Err(error) => return Err(error.into()),
+        match self.websocket.read() {
+            Ok(Message::Text(text)) => {
+                self.last_message = Instant::now();
+                Ok(Some((text, self.websocket.get_ref().last_byte())))
             }
+            Ok(Message::Close(_)) => Err(End::Closed),
+            Ok(Message::Binary(_)) => self.fault(Event::NotSocketIo, format_args!("a binary message")).map(|()| None),
+            // Answered by the next read. Returning lets deadlines be looked after, however many come.
+            Ok(_) => Ok(None),
+            Err(tungstenite::Error::Io(error)) if is_timeout(&error) => Ok(None),
+            Err(error) => Err(error.into()),
         }
     }
 
@@ -394,8 +402,8 @@ impl Connection<'_> {
 
     /// The handshake of Socket.IO for a client that seems to wait for it.
     fn greet(&mut self, now: Instant) -> Result<(), End> {
-        if self.greeting == Greeting::None && now.duration_since(self.opened) >= GREETING_TIME {
-            self.greeting = Greeting::Opened;
+        if !self.greeted && now.duration_since(self.opened) >= GREETING_TIME {
+            self.greeted = true;
             let version = self.client.version;
             let sid = session_id(self.peer.id);
             self.send(|out| protocol::print_open(out, version, &sid))?;
@@ -409,7 +417,7 @@ impl Connection<'_> {
 
     /// Pings of Engine.IO 4 come from the server.
     fn keep_alive(&mut self, now: Instant) -> Result<(), End> {
-        if self.greeting == Greeting::None || self.client.version == EngineVersion::V3 {
+        if !self.greeted || self.client.version == EngineVersion::V3 {
             return Ok(());
         }
         if now.duration_since(self.last_ping) >= Duration::from_millis(PING_INTERVAL_MS) {
@@ -473,7 +481,7 @@ impl Connection<'_> {
                     return self.send(|out| protocol::print_namespace_refused(out, version, namespace));
                 }
                 // The simulator never asks; Socket.IO 2 was connected without being asked.
-                if self.greeting == Greeting::Opened && version == EngineVersion::V4 {
+                if self.greeted && version == EngineVersion::V4 {
                     let sid = session_id(self.peer.id);
                     self.send(|out| protocol::print_connected(out, version, &sid))?;
                 }
@@ -654,6 +662,7 @@ impl Connection<'_> {
             let _ = self.steer(command);
         }
         let _ = self.websocket.close(None);
+        self.websocket.get_mut().finish(FAREWELL);
     }
 
     fn steer(&mut self, command: Command) -> Result<(), End> {

@@ -8,8 +8,6 @@ const MESSAGE_S: f64 = 0.004;
 const BYTE_S: f64 = 1e-6;
 /// What can be saved up, s: enough for a handshake and the first telemetry.
 const MOST_CREDIT_S: f64 = 0.5;
-/// Longest pause at once.
-const LONGEST_PAUSE: Duration = Duration::from_millis(200);
 
 /// Credit of a connection in seconds: each second brings one, messages cost some.
 #[derive(Clone, Debug)]
@@ -30,7 +28,7 @@ impl Pace {
         self.last = now;
         self.credit_s = (self.credit_s + earned_s).min(MOST_CREDIT_S);
         self.credit_s -= messages as f64 * MESSAGE_S + bytes as f64 * BYTE_S;
-        Duration::from_secs_f64((-self.credit_s).max(0.0)).min(LONGEST_PAUSE)
+        Duration::from_secs_f64((-self.credit_s).max(0.0))
     }
 }
 

@@ -16,7 +16,7 @@ use time::OffsetDateTime;
 use super::helm::Clock;
 use super::protocol::Command;
 use crate::error::{Error, Result};
-use crate::simulator::recorder::create_new_folder;
+use crate::new_folder::create_now;
 
 /// Rows on their way to the disk; a second or two of driving.
 const QUEUE: usize = 64;
@@ -80,7 +80,7 @@ impl Recorder {
     ///
     /// If the folder exists or cannot be written.
     pub fn start(folder: &Path) -> Result<Recorder> {
-        create_new_folder(folder)?;
+        create_now(folder)?;
         let images = folder.join("IMG");
         fs::create_dir(&images).map_err(Error::io(&images))?;
         let log = folder.join("driving_log.csv");

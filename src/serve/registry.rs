@@ -1,7 +1,7 @@
 //! The connections there are: never more than a fixed number.
 
 use std::net::{Shutdown, TcpStream};
-use std::sync::atomic::{AtomicU8, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -23,6 +23,7 @@ pub(super) struct Peer {
     pub id: u64,
     pub stream: Arc<TcpStream>,
     stage: AtomicU8,
+    closing: AtomicBool,
 }
 
 impl Peer {
@@ -32,6 +33,11 @@ impl Peer {
             1 => Stage::Open,
             _ => Stage::Trusted,
         }
+    }
+
+    /// Whether it has to make room.
+    pub fn is_closing(&self) -> bool {
+        self.closing.load(Ordering::Relaxed)
     }
 
     pub fn set_stage(&self, stage: Stage) {
@@ -66,6 +72,7 @@ impl Registry {
             else {
                 return (None, false);
             };
+            victim.closing.store(true, Ordering::Relaxed);
             // It may be closed already.
             let _ = victim.stream.shutdown(Shutdown::Both);
             while peers.len() >= self.most {
@@ -76,7 +83,7 @@ impl Registry {
                 peers = self.left.wait_timeout(peers, left).unwrap_or_else(PoisonError::into_inner).0;
             }
         }
-        let peer = Arc::new(Peer { id, stream: stream.clone(), stage: AtomicU8::new(Stage::Opening as u8) });
+        let peer = Arc::new(Peer { id, stream: stream.clone(), stage: AtomicU8::new(Stage::Opening as u8), closing: AtomicBool::new(false) });
         peers.push(peer.clone());
         (Some(peer), full)
     }
@@ -107,6 +114,7 @@ mod tests {
         // Nobody leaves in time: no room, but 2 was told to.
         let (none, closed) = registry.add(3, &stream(), patience);
         assert!(none.is_none() && closed);
+        assert!(peers[2].is_closing() && !peers[1].is_closing());
         assert_eq!((&*peers[2].stream).read(&mut [0]).unwrap(), 0);
         std::thread::scope(|scope| {
             scope.spawn(|| {

@@ -1,7 +1,7 @@
 //! A TCP connection that knows when its last byte came, and comes back to its owner at a steady beat.
 
-use std::io::{self, Read, Write};
-use std::net::TcpStream;
+use std::io::{self, ErrorKind, Read, Write};
+use std::net::{Shutdown, TcpStream};
 use std::time::{Duration, Instant};
 
 /// Longest time that sending may block: a client that does not read is given up.
@@ -63,6 +63,22 @@ impl Socket {
         Ok(())
     }
 
+    /// Tells the client that nothing more comes, and reads on for at most `patience` until it has left. If bytes remained
+    /// unread when the connection is closed, the system would take back what was sent last.
+    pub fn finish(&mut self, patience: Duration) {
+        // Whoever is gone needs no farewell.
+        let _ = self.stream.shutdown(Shutdown::Write);
+        let began = Instant::now();
+        let mut rest = [0; 4096];
+        while began.elapsed() < patience {
+            match self.stream.read(&mut rest) {
+                Ok(0) => return,
+                Err(error) if !is_timeout(&error) => return,
+                _ => {}
+            }
+        }
+    }
+
     /// Acknowledges what has come at once. The simulator sends a message in pieces and waits for the acknowledgement of one
     /// before it sends the last (Nagle's algorithm), which the system would otherwise delay by up to 40 ms.
     #[cfg(target_os = "linux")]
@@ -76,10 +92,15 @@ impl Socket {
     fn acknowledge(&self) {}
 }
 
+/// Whether an error only says that nothing has come yet.
+pub(super) fn is_timeout(error: &io::Error) -> bool {
+    matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted)
+}
+
 impl Read for Socket {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         if self.waiting && self.beat_began.elapsed() >= self.beat {
-            return Err(io::ErrorKind::WouldBlock.into());
+            return Err(ErrorKind::WouldBlock.into());
         }
         let len = self.stream.read(buffer)?;
         self.last_byte = Instant::now();

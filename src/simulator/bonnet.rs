@@ -1,7 +1,10 @@
 //! The car's bonnet, as each of the three cameras sees it.
 
+use std::ops::Range;
+
 use super::camera::{HEIGHT, Mount, RgbFrame, WIDTH};
 use super::light::Variant;
+use super::renderer::SPAN;
 
 /// Row at which the bonnet begins in a column; `HEIGHT` where there is none.
 fn top(mount: Mount, column: usize) -> f32 {
@@ -43,32 +46,60 @@ fn colour(mount: Mount, column: usize, depth: f32) -> [f32; 3] {
     }
 }
 
-/// The pixels of the bonnet for each camera, painted once.
-pub(super) struct Bonnet([Vec<(usize, [u8; 3])>; 3]);
+/// The bonnet as one camera sees it.
+struct Picture {
+    /// Pixels that it covers, with their colours.
+    pixels: Vec<(usize, [u8; 3])>,
+    /// For each row the spans of [`SPAN`] pixels that lie wholly behind it; they are neighbours.
+    hidden: Vec<Range<usize>>,
+}
+
+impl Picture {
+    fn paint(mount: Mount) -> Picture {
+        let depth = |row: usize, column: usize| row as f32 + 0.5 - top(mount, column);
+        let mut pixels = Vec::new();
+        let mut hidden = Vec::new();
+        for row in 0..HEIGHT {
+            for column in (0..WIDTH).filter(|column| depth(row, *column) > 0.0) {
+                let rgb = colour(mount, column, depth(row, column)).map(|c| c as u8);
+                pixels.push((row * WIDTH + column, rgb));
+            }
+            let is_hidden = |k: &usize| (k * SPAN..(k + 1) * SPAN).all(|column| depth(row, column) > 0.0);
+            let first = (0..WIDTH / SPAN).find(is_hidden).unwrap_or(0);
+            hidden.push(first..first + (first..WIDTH / SPAN).take_while(is_hidden).count());
+        }
+        Picture { pixels, hidden }
+    }
+}
+
+/// The bonnet as each camera sees it, painted once.
+pub(super) struct Bonnet([Picture; 3]);
 
 impl Default for Bonnet {
     fn default() -> Self {
-        Bonnet(Mount::ALL.map(|mount| {
-            let mut pixels = Vec::new();
-            for row in 0..HEIGHT {
-                for column in 0..WIDTH {
-                    let depth = row as f32 + 0.5 - top(mount, column);
-                    if depth > 0.0 {
-                        pixels.push(((row * WIDTH + column) * 3, colour(mount, column, depth).map(|c| c as u8)));
-                    }
-                }
-            }
-            pixels
-        }))
+        Bonnet(Mount::ALL.map(Picture::paint))
     }
 }
 
 impl Bonnet {
+    fn picture(&self, mount: Mount) -> &Picture {
+        match mount {
+            Mount::Center => &self.0[0],
+            Mount::Left => &self.0[1],
+            Mount::Right => &self.0[2],
+        }
+    }
+
+    /// Spans of a row of which nothing is seen.
+    pub(super) fn hidden_spans(&self, mount: Mount, row: usize) -> Range<usize> {
+        self.picture(mount).hidden[row].clone()
+    }
+
     /// Draws the bonnet over the bottom of the picture.
     pub(super) fn draw(&self, mount: Mount, variant: &Variant, frame: &mut RgbFrame) {
-        let pixels = &self.0[Mount::ALL.iter().position(|m| *m == mount).unwrap_or(0)];
-        for (at, rgb) in pixels {
-            for ((out, tone), value) in frame.pixels[*at..at + 3].iter_mut().zip(&variant.tone).zip(rgb) {
+        let (pixels, _) = frame.pixels.as_chunks_mut::<3>();
+        for (at, rgb) in &self.picture(mount).pixels {
+            for ((out, tone), value) in pixels[*at].iter_mut().zip(&variant.tone).zip(rgb) {
                 *out = tone[usize::from(*value)];
             }
         }

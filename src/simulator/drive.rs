@@ -6,12 +6,13 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Instant;
 
 use rayon::prelude::*;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::run::{Driver, Expert, INTERVENTION_M, Run, RunOptions, line_errors_m, run};
 use super::speed::Speed;
 use super::statistics::{PairedTest, wilson_interval};
 use super::track::Track;
+use crate::new_folder::NewFolder;
 use crate::{Error, Result};
 
 /// How a driver is put to the test.
@@ -49,7 +50,7 @@ pub struct RunPair {
 }
 
 /// The measures of a drive; the fields of `drive --json`.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct DriveSummary {
     /// Track as given on the command line.
     pub track: String,
@@ -239,19 +240,24 @@ pub fn compare(a: &DriveResult, b: &DriveResult) -> Result<Vec<PairedTest>> {
     ])
 }
 
-/// Writes the runs as `free_SEED.csv` and `assisted_SEED.csv` into the folder `out`, which must not exist.
+/// Writes the runs as `free_SEED.csv` and `assisted_SEED.csv`, and their summary as `summary.json`, into the folder `out`, which
+/// must not exist.
 ///
 /// # Errors
 /// If `out` exists or cannot be written.
 pub fn write_trajectories(result: &DriveResult, out: &Path) -> Result<()> {
-    super::recorder::create_new_folder(out)?;
+    let folder = NewFolder::create(out)?;
     for pair in &result.runs {
         for (kind, run) in [("free", &pair.free), ("assisted", &pair.assisted)] {
-            let path = out.join(format!("{kind}_{}.csv", pair.seed));
-            std::fs::write(&path, trajectory_csv(run)).map_err(Error::io(&path))?;
+            let path = folder.unfinished().join(format!("{kind}_{}.csv", pair.seed));
+            let written = std::fs::write(&path, trajectory_csv(run));
+            written.map_err(|source| folder.explain(Error::Io { path, source }))?;
         }
     }
-    Ok(())
+    let path = folder.unfinished().join("summary.json");
+    let text = serde_json::to_string_pretty(&result.summary).map_err(|e| Error::data(&path, e.to_string()))?;
+    std::fs::write(&path, text + "\n").map_err(|source| folder.explain(Error::Io { path, source }))?;
+    folder.finish()
 }
 
 /// A run as CSV text, one line for each frame.

@@ -105,8 +105,10 @@ mod tests {
 
     #[test]
     fn cross_track_error_stays_small_on_every_track_in_both_directions() {
-        for name in ["lake", "mountain", "coast", "forest", "random:1", "random:2", "random:1000001"] {
-            let track = Track::load(name).unwrap();
+        let random = (0..24).chain(1_000_000..1_000_024).map(|seed| format!("random:{seed}"));
+        let (mut worst_p95, mut worst) = (0.0, 0.0);
+        for name in ["lake", "mountain", "coast", "forest"].map(String::from).into_iter().chain(random) {
+            let track = Track::load(&name).unwrap();
             for reverse in [false, true] {
                 let start = Start { s_m: 0.0, reverse, offset_m: 0.0, heading_deg: 0.0 };
                 let speed = 20.0 * MPS_PER_MPH;
@@ -120,10 +122,13 @@ mod tests {
                 assert!(simulation.progress_m >= track.length_m, "{name} {reverse}");
                 errors.sort_by(f64::total_cmp);
                 let (p95, max) = (errors[errors.len() * 95 / 100], errors[errors.len() - 1]);
-                eprintln!("expert {name} reverse {reverse}: cross-track error p95 {p95:.3} m, max {max:.3} m");
                 assert!(p95 <= 0.3 && max <= 0.8, "{name} reverse {reverse}: p95 {p95} max {max}");
+                (worst_p95, worst) = (f64::max(worst_p95, p95), f64::max(worst, max));
             }
         }
+        eprintln!(
+            "expert on 52 tracks, both directions: cross-track error p95 at most {worst_p95:.3} m, max {worst:.3} m"
+        );
     }
 
     #[test]

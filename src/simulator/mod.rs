@@ -35,7 +35,7 @@ mod world;
 
 pub use camera::{BodyPose, Camera, HEIGHT, Mount, RgbFrame, WIDTH};
 pub use closed_loop::ClosedLoop;
-pub use contact_sheet::contact_sheet;
+pub use contact_sheet::{contact_sheet, side_by_side};
 pub use drive::{DriveOptions, DriveResult, DriveSummary, compare, drive};
 pub use light::Variant;
 pub use recorder::{LogFormat, RecordOptions, record};

@@ -2,14 +2,18 @@
 
 use super::camera::{FOCAL_PX, HEIGHT, RgbFrame, WIDTH};
 use super::math::{Vec3, hash2, lerp};
-use super::renderer::{View, lit};
+use super::renderer::{FULL, View};
 use super::spec::Wall;
+use super::terrain::fixed;
 use super::world::{Sprite, WallPiece};
 
 /// Nothing nearer than this is drawn, m.
 const NEAREST_M: f32 = 0.35;
 /// Things farther than this are not drawn, m.
 const FARTHEST_M: f32 = 330.0;
+
+/// Bits behind the point of fixed-point places on a picture.
+const FRACTION_BITS: u32 = 14;
 
 /// Draws walls and sprites over the ground of `frame`.
 pub(super) fn draw(depths: &mut [f32], view: &View, frame: &mut RgbFrame) {
@@ -40,8 +44,11 @@ fn draw_sprite(depths: &mut [f32], view: &View, sprite: &Sprite, frame: &mut Rgb
     let level = picture.level(high);
     let (w, h) = (level.width, level.height);
     let light = (sprite.light * 256.0).min(256.0) as u32;
-    let (inverse, haze) = (1.0 / foot.z, view.air(foot.z));
+    let (inverse, air) = (1.0 / foot.z, view.air(foot.z));
+    let (pixels, _) = frame.pixels.as_chunks_mut();
     let (du, dv) = (w as f32 / wide, h as f32 / high);
+    let one = (1 << FRACTION_BITS) as f32;
+    let step = fixed(du * one);
     let first_row = (top + 0.5) as usize;
     let last_row = (bottom + 0.5) as usize;
     for row in first_row..last_row.min(HEIGHT) {
@@ -52,16 +59,22 @@ fn draw_sprite(depths: &mut [f32], view: &View, sprite: &Sprite, frame: &mut Rgb
         let (from, to) = if sprite.mirrored { (w - to, w - from) } else { (from, to) };
         let first = (left + from as f32 / du + 0.5).max(0.0) as usize;
         let last = ((left + to as f32 / du + 0.5).max(0.0) as usize).min(WIDTH);
-        for column in first..last {
-            let at = row * WIDTH + column;
-            if depths[at] > inverse {
+        if first >= last {
+            continue;
+        }
+        let texels = &level.texels[v * w..(v + 1) * w];
+        let mut u = fixed((first as f32 + 0.5 - left) * du * one);
+        let span = row * WIDTH + first..row * WIDTH + last;
+        for (depth, out) in depths[span.clone()].iter_mut().zip(&mut pixels[span]) {
+            let at = ((u >> FRACTION_BITS) as usize).min(w - 1);
+            u += step;
+            if *depth > inverse {
                 continue;
             }
-            let u = (((column as f32 + 0.5 - left) * du).max(0.0) as usize).min(w - 1);
-            let texel = level.texels[v * w + if sprite.mirrored { w - 1 - u } else { u }];
+            let texel = texels[if sprite.mirrored { w - 1 - at } else { at }];
             if texel >> 31 == 1 {
-                depths[at] = inverse;
-                view.finish(lit(texel, light), haze, &mut frame.pixels[3 * at..3 * at + 3]);
+                *depth = inverse;
+                view.finish(texel, light, &air, out);
             }
         }
     }
@@ -130,6 +143,7 @@ fn draw_wall(depths: &mut [f32], view: &View, piece: &WallPiece, frame: &mut Rgb
     let first = (x0 + 0.5).max(0.0) as usize;
     let last = ((x1 + 0.5).max(0.0) as usize).min(WIDTH);
     let (low_m, high_m) = wall_height(piece.wall);
+    let (pixels, _) = frame.pixels.as_chunks_mut();
     for column in first..last {
         let t = (column as f32 + 0.5 - x0) / (x1 - x0).max(1e-3);
         let inverse = lerp(i0, i1, t);
@@ -137,7 +151,7 @@ fn draw_wall(depths: &mut [f32], view: &View, piece: &WallPiece, frame: &mut Rgb
         let along_m = piece.along_m + lerp(u0 * i0, u1 * i1, t) / inverse;
         let per_m = FOCAL_PX * inverse * up;
         let (top, bottom) = (foot - high_m * per_m, foot - low_m * per_m);
-        let haze = view.air(1.0 / inverse);
+        let air = view.air(1.0 / inverse);
         let rows = (top + 0.5).clamp(0.0, HEIGHT as f32) as usize..(bottom + 1.0).clamp(0.0, HEIGHT as f32) as usize;
         for row in rows {
             let at = row * WIDTH + column;
@@ -148,7 +162,7 @@ fn draw_wall(depths: &mut [f32], view: &View, piece: &WallPiece, frame: &mut Rgb
             if let Some(rgb) = wall_colour(piece.wall, along_m, (foot - row as f32 - 0.5) / per_m) {
                 depths[at] = inverse;
                 let rgb = rgb.map(|c| (c * piece.light.min(1.1)) as u32);
-                view.finish(rgb[0] | rgb[1] << 8 | rgb[2] << 16, haze, &mut frame.pixels[3 * at..3 * at + 3]);
+                view.finish(rgb[0] | rgb[1] << 8 | rgb[2] << 16, FULL, &air, &mut pixels[at]);
             }
         }
     }

@@ -85,7 +85,8 @@ impl Picture {
                     let four = [0, 1, 2 * w, 2 * w + 1].map(|o| fine[2 * v * 2 * w + 2 * u + o]);
                     let weight: u32 = four.iter().map(|t| t >> 24).sum();
                     let channel = |s: u32| four.iter().map(|t| (t >> s & 255) * (t >> 24)).sum::<u32>() / weight.max(1);
-                    channel(0) | channel(8) << 8 | channel(16) << 16 | (weight / 3).min(255) << 24
+                    // More than the mean, so that thin trunks do not vanish from afar.
+                    channel(0) | channel(8) << 8 | channel(16) << 16 | (weight * 2 / 5).min(255) << 24
                 })
                 .collect();
             levels.push(coarse);
@@ -106,12 +107,13 @@ fn texel(plant: Plant, x: f32, y: f32, u: i32, v: i32, seed: u32) -> u32 {
         dx * dx + dy * dy + (leaf - 0.5) * 1.1 < 1.0
     };
     let trunk = |half: f32, top: f32| x.abs() < half && y < top;
-    let side = 1.0 - 0.35 * (x > 0.0) as u8 as f32;
+    // Light comes from the left.
+    let side = 0.84 - 0.2 * x;
     match plant {
         Plant::Pine => {
             let tufts = (0..6).any(|k| {
                 let h = hash2(k, 7, seed);
-                lobe((h - 0.5) * 0.9, 0.5 + 0.08 * k as f32, 0.62 - 0.07 * k as f32, 0.085)
+                lobe((h - 0.5) * 0.6, 0.5 + 0.08 * k as f32, 0.55 - 0.055 * k as f32, 0.075)
             });
             if tufts {
                 solid([92.0, 104.0, 50.0], shade)
@@ -122,7 +124,7 @@ fn texel(plant: Plant, x: f32, y: f32, u: i32, v: i32, seed: u32) -> u32 {
             }
         }
         Plant::Broadleaf => {
-            let crown = lobe(0.0, 0.62, 0.85, 0.33) || lobe(-0.45, 0.5, 0.5, 0.2) || lobe(0.4, 0.55, 0.5, 0.24);
+            let crown = lobe(0.0, 0.64, 0.72, 0.27) || lobe(-0.42, 0.52, 0.42, 0.18) || lobe(0.4, 0.56, 0.44, 0.22);
             if crown {
                 solid([84.0, 100.0, 44.0], shade)
             } else if trunk(0.08, 0.5) {
@@ -134,12 +136,12 @@ fn texel(plant: Plant, x: f32, y: f32, u: i32, v: i32, seed: u32) -> u32 {
         Plant::Palm => {
             let bend = 0.18 * y * y;
             let (dx, dy) = (x - bend, y - 0.74);
-            let fronds = (0..9).any(|k| {
-                let turn = (k as f32 - 4.0) / 4.0;
-                let (fx, fy) = (turn, 0.55 - turn.abs() * 0.55);
-                let t = (dx * fx + dy * 3.2 * fy) / (fx * fx + fy * fy);
-                let (px, py) = (dx - fx * t, dy * 3.2 - fy * t + 0.9 * t * t * turn.abs());
-                (0.0..0.95).contains(&t) && px * px + py * py < 0.012 * (1.1 - t) + 0.006 * leaf
+            // Each frond rises from the crown and bows down; long ones rise less.
+            let fronds = (0..5).any(|k| {
+                let reach = 0.92 - 0.13 * k as f32 - 0.12 * hash2(k, i32::from(dx > 0.0), seed);
+                let t = dx.abs() / reach;
+                let bow = (0.02 + 0.11 * k as f32) * t - (0.3 + 0.03 * k as f32) * t * t;
+                t < 1.0 && (dy - bow).abs() < (0.012 + 0.03 * (1.0 - t)) * (0.4 + 1.2 * leaf)
             });
             if fronds {
                 solid([74.0, 88.0, 46.0], shade * 0.9)
@@ -150,8 +152,10 @@ fn texel(plant: Plant, x: f32, y: f32, u: i32, v: i32, seed: u32) -> u32 {
             }
         }
         Plant::Bush => {
-            if lobe(0.0, 0.35, 0.95, 0.6) || lobe(-0.4, 0.3, 0.6, 0.55) {
-                solid([70.0, 80.0, 38.0], shade * 0.85)
+            let clump =
+                [(-0.5, 0.2, 0.36, 0.3), (-0.14, 0.36, 0.4, 0.4), (0.26, 0.28, 0.4, 0.36), (0.56, 0.14, 0.32, 0.26)];
+            if clump.iter().any(|(cx, cy, rx, ry)| lobe(*cx, *cy, *rx, *ry)) {
+                solid([86.0, 96.0, 46.0], shade * 0.85)
             } else {
                 0
             }
@@ -162,7 +166,7 @@ fn texel(plant: Plant, x: f32, y: f32, u: i32, v: i32, seed: u32) -> u32 {
         }
         Plant::Fir => {
             let tier = 1.0 - (y * 9.0).fract();
-            let half = (1.0 - y) * (0.75 + 0.3 * tier);
+            let half = (1.0 - y) * (0.6 + 0.26 * tier);
             if y > 0.04 && x.abs() + (leaf - 0.5) * 0.3 < half {
                 solid([48.0, 68.0, 46.0], (0.5 + 0.3 * tier + 0.35 * leaf) * side)
             } else if trunk(0.06, 0.1) {
@@ -172,7 +176,7 @@ fn texel(plant: Plant, x: f32, y: f32, u: i32, v: i32, seed: u32) -> u32 {
             }
         }
         Plant::Birch => {
-            let crown = lobe(0.0, 0.7, 0.8, 0.29) || lobe(0.2, 0.5, 0.55, 0.16);
+            let crown = lobe(0.0, 0.7, 0.7, 0.22) || lobe(0.2, 0.5, 0.5, 0.14);
             if crown && leaf > 0.3 {
                 solid([134.0, 146.0, 70.0], shade)
             } else if trunk(0.06, 0.9) {
@@ -183,7 +187,7 @@ fn texel(plant: Plant, x: f32, y: f32, u: i32, v: i32, seed: u32) -> u32 {
             }
         }
         Plant::Boulder => {
-            if lobe(0.0, 0.3, 0.95, 0.62) {
+            if lobe(0.0, 0.22, 0.76, 0.55) {
                 solid([150.0, 142.0, 126.0], (0.5 + 0.4 * leaf + 0.35 * y) * side)
             } else {
                 0

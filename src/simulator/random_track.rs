@@ -82,42 +82,51 @@ fn pick<T: Copy>(rng: &mut Rng, of: &[T]) -> T {
     of[rng.below(of.len())]
 }
 
-fn look(rng: &mut Rng, name: &str, centre: Centre) -> Look {
+/// A road's colour: any grey from dark to light, a little tinted.
+fn road_tone(rng: &mut Rng) -> Rgb {
+    let grey = rng.between(62.0, 196.0);
+    let warm = rng.between(-0.08, 0.16);
+    [1.0 + warm, 1.0, 1.0 - warm].map(|tint| (grey * tint + rng.between(-6.0, 6.0)).clamp(8.0, 247.0) as u8)
+}
+
+/// A colour of soil, sand or grass: hue 20 to 110 degrees (orange to green), dark to light, dull to strong.
+fn soil(rng: &mut Rng) -> Rgb {
+    let (hue, saturation, value) = (rng.between(20.0, 110.0), rng.between(0.1, 0.68), rng.between(64.0, 226.0));
+    // The largest channel is `value`, the smallest blue; the one between follows the hue.
+    let low = value * (1.0 - saturation);
+    let [red, green] = if hue < 60.0 { [1.0, (hue / 60.0)] } else { [1.0 - (hue - 60.0) / 60.0, 1.0] }
+        .map(|k| low + (value - low) * k);
+    [red, green, low].map(|c| c as u8)
+}
+
+/// Widest shoulder, m: what is left of the texture beyond an edge.
+const SHOULDER_M: f64 = 3.5;
+
+fn look(rng: &mut Rng, name: &str) -> Look {
     let surface = pick(rng, &[Surface::Asphalt, Surface::Asphalt, Surface::Patched, Surface::Patched, Surface::Cobble]);
-    let base =
-        pick(rng, &[[112, 110, 106], [84, 84, 86], [138, 134, 128], [136, 118, 102], [104, 92, 84], [160, 154, 144]]);
-    let edges = [Edge::White, Edge::Yellow, Edge::YellowKerbstone, Edge::Kerb, Edge::Bare, Edge::Bare];
+    let centre = pick(rng, &[Centre::None, Centre::None, Centre::Dashed, Centre::Dashed, Centre::Solid]);
+    let edges = [Edge::White, Edge::Yellow, Edge::YellowKerbstone, Edge::Kerb, Edge::Bare, Edge::Bare, Edge::Bare];
     let left = pick(rng, &edges);
-    let right = if rng.unit() < 0.7 { left } else { pick(rng, &edges) };
-    let soil =
-        pick(rng, &[[120, 112, 70], [150, 112, 76], [96, 104, 58], [176, 160, 120], [110, 104, 96], [88, 78, 58]]);
+    let right = if rng.unit() < 0.6 { left } else { pick(rng, &edges) };
     Look {
         name: name.to_string(),
         surface,
-        tone: near(rng, base, 22.0),
-        grain: rng.between(0.12, 0.6) as f32,
+        tone: road_tone(rng),
+        grain: rng.between(0.08, 0.7) as f32,
         centre,
         left,
         right,
-        shoulder: near(rng, soil, 20.0),
-        shoulder_m: rng.between(0.3, 3.0) as f32,
+        shoulder: soil(rng),
+        shoulder_m: rng.between(0.2, SHOULDER_M) as f32,
     }
 }
 
+/// Names of the looks of a random track.
+const LOOKS: [&str; 3] = ["first", "second", "third"];
+
 fn looks(seed: u64, rng: &mut Rng) -> TrackSpec {
-    let centre = pick(rng, &[Centre::None, Centre::None, Centre::Dashed, Centre::Dashed, Centre::Solid]);
-    let look = vec![look(rng, "first", centre), look(rng, "second", centre), look(rng, "third", Centre::None)];
-    let ground = pick(
-        rng,
-        &[
-            [[150, 142, 48], [112, 118, 46]],
-            [[84, 100, 44], [104, 106, 62]],
-            [[176, 150, 104], [146, 128, 84]],
-            [[70, 86, 40], [96, 82, 54]],
-            [[190, 172, 132], [150, 146, 98]],
-            [[112, 124, 66], [134, 120, 80]],
-        ],
-    );
+    let look = LOOKS.map(|name| look(rng, name)).to_vec();
+    let ground = [soil(rng), soil(rng)];
     let all = [Plant::Pine, Plant::Broadleaf, Plant::Palm, Plant::Bush, Plant::Boulder];
     let sky = pick(
         rng,
@@ -140,35 +149,35 @@ fn looks(seed: u64, rng: &mut Rng) -> TrackSpec {
             seed: (seed % 1_000_003) as u32 + 101,
             hills_m: rng.between(6.0, 44.0) as f32,
             water_level_m: (rng.unit() < 0.5).then_some(-2.5),
-            ground: ground.map(|g| near(rng, g, 18.0)),
+            ground,
             rock: near(rng, [120, 112, 96], 30.0),
             shore: near(rng, [176, 150, 112], 24.0),
             water: near(rng, [110, 146, 176], 32.0),
             plants: (0..4).map(|_| pick(rng, &all)).collect(),
-            plants_per_100_m: rng.between(4.0, 30.0) as f32,
-            plants_from_m: rng.between(2.2, 5.0) as f32,
+            plants_per_100_m: rng.between(2.0, 40.0) as f32,
+            plants_from_m: rng.between(2.0, 5.0) as f32,
             posts: pick(rng, &[None, Some(Plant::Post), Some(Plant::Board)]),
         },
         light: Light {
             sun_azimuth_deg: rng.between(0.0, 360.0),
-            sun_elevation_deg: rng.between(22.0, 65.0),
-            shade: rng.between(0.28, 0.6) as f32,
-            sun: near(rng, [248, 242, 228], 8.0),
+            sun_elevation_deg: rng.between(20.0, 68.0),
+            shade: rng.between(0.25, 0.7) as f32,
+            sun: near(rng, [242, 236, 220], 14.0),
             zenith: near(rng, sky.0, 12.0),
             horizon: near(rng, sky.1, 12.0),
-            haze_m: rng.between(180.0, 900.0) as f32,
+            haze_m: rng.between(120.0, 900.0) as f32,
             clouds: (rng.unit() * 1.4 - 0.5).clamp(0.0, 0.9) as f32,
         },
     }
 }
 
-/// Cuts the lap into stretches of 60 to 180 m, each with its own look, land and perhaps walls.
+/// Cuts the lap into stretches of 40 to 120 m, each with its own look, land and perhaps walls.
 fn stretches(rng: &mut Rng, lap_m: f64, spec: &TrackSpec) -> Vec<Stretch> {
     let mut out = Vec::new();
     let mut from_m = 0.0;
     let water = spec.land.water_level_m.is_some();
     while from_m < lap_m - 30.0 {
-        let to_m = (from_m + rng.between(60.0, 180.0)).min(lap_m);
+        let to_m = (from_m + rng.between(40.0, 120.0)).min(lap_m);
         let mut side = || {
             let side =
                 pick(rng, &[Side::Flat, Side::Flat, Side::Hill, Side::Hill, Side::Cliff, Side::Drop, Side::Water]);
@@ -180,7 +189,7 @@ fn stretches(rng: &mut Rng, lap_m: f64, spec: &TrackSpec) -> Vec<Stretch> {
             (rng.unit() < if open { 0.5 } else { 0.08 }).then(|| pick(rng, &[Wall::Rail, Wall::Parapet]))
         };
         let (left_wall, right_wall) = (wall(left), wall(right));
-        let look = pick(rng, &["first", "first", "first", "second", "third"]);
+        let look = pick(rng, &LOOKS);
         out.push(Stretch {
             from_m,
             to_m,

@@ -11,17 +11,20 @@ use serde::Serialize;
 use super::camera::{BodyPose, Camera, Mount, RgbFrame};
 use super::car::{Controls, MPS_PER_MPH, STEP_S, STEPS_PER_S};
 use super::expert::{Keyboard, Style, pursuit};
+use super::eye::Eye;
 use super::jpeg;
 use super::light::Variant;
 use super::math::Rng;
 use super::noise::SteeringNoise;
 use super::renderer::Renderer;
+use super::run::{DRIVE_HZ, DriveState, Driver};
 use super::simulation::{Simulation, Start};
 use super::speed::SpeedController;
 use super::track::Track;
+use crate::new_folder::NewFolder;
 use crate::{Error, Result};
 
-/// Rows of the log for each second.
+/// Rows of the log for each second, unless told otherwise.
 pub const RECORD_HZ: u64 = 10;
 
 /// How the log is written.
@@ -51,6 +54,8 @@ pub struct RecordOptions {
     pub speed_mph: f64,
     /// Strength of a disturbance of the steering that the labels do not show: standard deviation of the steering.
     pub noise: f64,
+    /// Rows of the log for each second: 1, 2, 5, 10, 25 or 50.
+    pub hz: u64,
     /// How the log is written.
     pub format: LogFormat,
 }
@@ -65,6 +70,7 @@ impl Default for RecordOptions {
             seed: 1,
             speed_mph: 20.0,
             noise: 0.0,
+            hz: RECORD_HZ,
             format: LogFormat::Sample,
         }
     }
@@ -121,6 +127,7 @@ struct Session<'a> {
     keyboard: Option<Keyboard>,
     noise: SteeringNoise,
     target_mph: f64,
+    steps_per_row: u64,
 }
 
 impl Session<'_> {
@@ -141,13 +148,13 @@ impl Session<'_> {
         Sample { time_s, body, steering, throttle: throttle.max(0.0), brake: (-throttle).max(0.0), speed_mph }
     }
 
-    /// Drives `steps` steps or until `done`, taking a sample at every tenth of a second.
+    /// Drives `steps` steps or until `done`, taking a sample whenever a row is due.
     fn drive(&mut self, steps: u64, samples: &mut Vec<Sample>, done: impl Fn(&Simulation) -> bool) {
         for step in 0..steps {
             if done(&self.simulation) {
                 return;
             }
-            let due = step % (STEPS_PER_S / RECORD_HZ) == 0;
+            let due = step % self.steps_per_row == 0;
             let before =
                 due.then(|| (self.simulation.time_s(), self.simulation.body_pose(), self.simulation.car.speed_mps));
             let driven = self.step();
@@ -169,6 +176,7 @@ pub fn drive_expert(track: &Track, options: &RecordOptions) -> Vec<Sample> {
         keyboard: (options.style == Style::Keyboard).then(Keyboard::default),
         noise: SteeringNoise::new(options.seed, options.noise),
         target_mph: options.speed_mph,
+        steps_per_row: STEPS_PER_S / options.hz,
     };
     let way_m = options.laps * track.length_m;
     let most_steps = (way_m / speed_mps.max(1.0) * 3.0) as u64 * STEPS_PER_S + 500;
@@ -198,13 +206,71 @@ pub fn drive_expert(track: &Track, options: &RecordOptions) -> Vec<Sample> {
     samples
 }
 
+/// Distance from the line at which a driver who learns is put back, m: what lies beyond no longer teaches how to stay.
+const LOST_M: f64 = 2.2;
+
+/// Lets `driver` drive what `options` ask for and returns the rows, labelled with the expert's steering at every moment.
+/// In a share of the seconds, `expert_share`, the expert itself is at the wheel.
+///
+/// # Errors
+/// If a picture cannot be encoded.
+pub fn drive_and_label(
+    track: &Track,
+    options: &RecordOptions,
+    driver: &mut dyn Driver,
+    expert_share: f64,
+) -> Result<Vec<Sample>> {
+    let mut rng = Rng::new(options.seed, "who drives");
+    let start = Start { reverse: options.reverse, ..Start::draw(track, options.seed) };
+    let speed_mps = options.speed_mph * MPS_PER_MPH;
+    let mut simulation = Simulation::new(track, start, speed_mps);
+    let mut eye = Eye::new(track, options.seed);
+    let mut controller = SpeedController::default();
+    let way_m = options.laps * track.length_m;
+    let most_steps = (way_m / speed_mps.max(1.0) * 3.0) as u64 * STEPS_PER_S + 500;
+    let (mut samples, mut answer, mut frames, mut by_expert) = (Vec::new(), 0.0, 0, true);
+    for step in 0..most_steps {
+        if simulation.progress_m >= way_m {
+            break;
+        }
+        if step % STEPS_PER_S == 0 {
+            by_expert = rng.unit() < expert_share;
+        }
+        let label = pursuit(&simulation);
+        let speed_mph = simulation.car.speed_mps / MPS_PER_MPH;
+        let throttle = controller.throttle(options.speed_mph, speed_mph, STEP_S);
+        if step * DRIVE_HZ >= frames * STEPS_PER_S {
+            frames += 1;
+            let state = DriveState { simulation: &simulation, speed_mph };
+            answer = f64::from(driver.steer(eye.look(&simulation)?, &state));
+            answer = if answer.is_finite() { answer.clamp(-1.0, 1.0) } else { 0.0 };
+        }
+        if step % (STEPS_PER_S / options.hz) == 0 {
+            samples.push(Sample {
+                time_s: simulation.time_s(),
+                body: simulation.body_pose(),
+                steering: label,
+                throttle: throttle.max(0.0),
+                brake: (-throttle).max(0.0),
+                speed_mph,
+            });
+        }
+        simulation.step(Controls { steering: if by_expert { label } else { answer }, throttle });
+        if simulation.cte_m().abs() > LOST_M || simulation.at_wall {
+            simulation.put_back();
+        }
+    }
+    Ok(samples)
+}
+
 /// Records a drive of the expert into the new folder `out`: `driving_log.csv`, `IMG/` and `recording.toml`.
 ///
 /// Pictures are taken on all threads; the files do not depend on their number. `progress` is told the share that is done
 /// and may return `false` to stop.
 ///
 /// # Errors
-/// If `out` exists, if something cannot be written, or if `progress` stopped it. What was written stays.
+/// If `out` exists, if something cannot be written, or if `progress` stopped it. Nothing is left behind then: the folder
+/// gets its name when it is whole.
 pub fn record(
     track: &Track,
     options: &RecordOptions,
@@ -216,6 +282,9 @@ pub fn record(
     }
     if !(5.0..=30.0).contains(&options.speed_mph) {
         return Err(Error::Usage(format!("speed {} mph: 5 to 30 mph can be recorded", options.speed_mph)));
+    }
+    if options.hz == 0 || STEPS_PER_S % options.hz != 0 {
+        return Err(Error::Usage(format!("{} rows a second: 1, 2, 5, 10, 25 or 50 can be recorded", options.hz)));
     }
     let samples = drive_expert(track, options);
     write_recording(track, options, &samples, out, progress)
@@ -232,8 +301,22 @@ pub fn write_recording(
     out: &Path,
     progress: &(dyn Fn(f64) -> bool + Sync),
 ) -> Result<RecordingInfo> {
-    create_new_folder(out)?;
-    let images = out.join("IMG");
+    let folder = NewFolder::create(out)?;
+    let info = fill(track, options, samples, &folder, out, progress).map_err(|error| folder.explain(error))?;
+    folder.finish()?;
+    Ok(info)
+}
+
+/// Writes the files of a recording into `folder`, which will be called `out`.
+fn fill(
+    track: &Track,
+    options: &RecordOptions,
+    samples: &[Sample],
+    folder: &NewFolder,
+    out: &Path,
+    progress: &(dyn Fn(f64) -> bool + Sync),
+) -> Result<RecordingInfo> {
+    let images = folder.unfinished().join("IMG");
     fs::create_dir(&images).map_err(Error::io(&images))?;
     let world = track.world();
     let variant = Variant::new(world, options.seed);
@@ -252,8 +335,8 @@ pub fn write_recording(
             if progress(count as f64 / samples.len() as f64) { Ok(()) } else { Err(Error::Interrupted) }
         },
     )?;
-    let log = out.join("driving_log.csv");
-    write_log(&log, samples, options.format).map_err(Error::io(&log))?;
+    let log = folder.unfinished().join("driving_log.csv");
+    log_text(out, samples, options.format).and_then(|text| fs::write(&log, text)).map_err(Error::io(&log))?;
     let info = RecordingInfo {
         track: track.name().to_string(),
         held_out: track.held_out(),
@@ -264,30 +347,13 @@ pub fn write_recording(
         style: if options.style == Style::Keyboard { "keyboard" } else { "smooth" }.to_string(),
         speed_mph: options.speed_mph,
         noise: options.noise,
-        hz: RECORD_HZ,
+        hz: options.hz,
         rows: samples.len(),
     };
-    let side = out.join("recording.toml");
+    let side = folder.unfinished().join("recording.toml");
     let text = toml::to_string(&info).map_err(|e| Error::data(&side, e.to_string()))?;
     fs::write(&side, text).map_err(Error::io(&side))?;
     Ok(info)
-}
-
-/// Creates `out` with its parents; refuses one that exists.
-pub(crate) fn create_new_folder(out: &Path) -> Result<()> {
-    if let Some(parent) = out.parent().filter(|p| !p.as_os_str().is_empty()) {
-        fs::create_dir_all(parent).map_err(Error::io(parent))?;
-    }
-    fs::create_dir(out).map_err(|source| {
-        if source.kind() == io::ErrorKind::AlreadyExists {
-            Error::Usage(format!(
-                "{}: exists already and is not overwritten; name a new folder or remove it",
-                out.display()
-            ))
-        } else {
-            Error::Io { path: out.to_path_buf(), source }
-        }
-    })
 }
 
 /// Name of a picture taken `time_s` after noon of 1 January 2026, the simulator's fixed date.
@@ -298,10 +364,11 @@ fn image_name(mount: Mount, time_s: f64) -> String {
     format!("{}_2026_01_{day:02}_{hour:02}_{minute:02}_{second:02}_{:03}.jpg", mount.name(), ms % 1000)
 }
 
-fn write_log(log: &Path, samples: &[Sample], format: LogFormat) -> io::Result<()> {
+/// The log of a recording in the folder `out`.
+fn log_text(out: &Path, samples: &[Sample], format: LogFormat) -> io::Result<Vec<u8>> {
     let (separator, folder) = match format {
         LogFormat::Sample => (", ", PathBuf::from("IMG")),
-        LogFormat::V2 => (",", std::path::absolute(log)?.with_file_name("IMG")),
+        LogFormat::V2 => (",", std::path::absolute(out)?.join("IMG")),
     };
     let mut text = Vec::new();
     if format == LogFormat::Sample {
@@ -319,7 +386,7 @@ fn write_log(log: &Path, samples: &[Sample], format: LogFormat) -> io::Result<()
             [sample.steering, sample.throttle, sample.brake, sample.speed_mph].map(|v| (v as f32).to_string());
         writeln!(text, "{}", numbers.join(separator))?;
     }
-    fs::write(log, text)
+    Ok(text)
 }
 
 #[cfg(test)]
@@ -341,6 +408,23 @@ mod tests {
         assert!(samples.windows(2).all(|w| (w[1].time_s - w[0].time_s - 0.1).abs() < 1e-6));
         let settled = &samples[100..];
         assert!(settled.iter().all(|s| (s.speed_mph - 20.0).abs() < 2.5));
+    }
+
+    #[test]
+    fn whoever_drives_the_labels_are_the_experts() {
+        use super::super::run::{Expert, Zero};
+        let track = Track::load("lake").unwrap();
+        let options = RecordOptions { laps: 0.3, ..Default::default() };
+        let recorded = drive_and_label(&track, &options, &mut Expert, 0.0).unwrap();
+        let plain = drive_expert(&track, &options);
+        assert!(recorded.iter().zip(&plain).all(|(a, b)| (a.steering - b.steering).abs() < 0.1));
+        // Who never steers drifts off the line, and the labels say how to get back.
+        let strength =
+            |samples: &[Sample]| samples.iter().map(|s| s.steering.abs()).sum::<f64>() / samples.len() as f64;
+        let zero = drive_and_label(&track, &options, &mut Zero, 0.0).unwrap();
+        let helped = drive_and_label(&track, &options, &mut Zero, 0.5).unwrap();
+        assert!(strength(&zero) > 2.0 * strength(&plain), "{} {}", strength(&zero), strength(&plain));
+        assert!(strength(&helped) < strength(&zero));
     }
 
     #[test]

@@ -5,9 +5,10 @@
 //! 1. *March*: in every eighth column, from the bottom up, the ray of each pixel is followed over the land until it goes
 //!    below it. A ray is never blocked nearer than the ray below it, so each search starts where the last one ended, and a
 //!    crest hides what is behind it.
-//! 2. *Shade*: along each row the place on the land is interpolated between these columns (eight pixels at a time) and the
-//!    road's texture or the land's map is looked up at the resolution that fits. Where the ground breaks off between two
-//!    columns, each pixel is marched on its own. Pixels without ground show the sky.
+//! 2. *Shade*: along each row, again from the bottom up, the place on the land is interpolated between these columns (eight
+//!    pixels at a time) and the road's texture or the land's map is looked up at the resolution that fits. Where the ground
+//!    breaks off between two columns, each pixel is marched on its own, from where the ray of the pixel below ended. Pixels
+//!    without ground show the sky.
 //! 3. *Stand*: walls and upright things are drawn where they are nearer than the ground.
 //! 4. *Bonnet*: the car's own bonnet, which is always in the same place.
 
@@ -17,12 +18,12 @@ use super::light::Variant;
 use super::math::{Vec3, atan2, vec3};
 use super::objects;
 use super::road_texture::{ACROSS_UNITS, ACROSS_UNITS_PER_M, ALONG_UNITS_PER_M, HALF_M, Level};
-use super::sky::AROUND;
+use super::sky::{AROUND, SkyPlace};
 use super::terrain::{GROUND_UNITS_PER_M, GroundLevel, NO_STATION, clip, fixed};
 use super::world::World;
 
 /// Pixels between marched columns.
-const SPAN: usize = 8;
+pub(super) const SPAN: usize = 8;
 /// Marched columns: one more than spans, so that the last span has two ends.
 const ANCHORS: usize = WIDTH / SPAN + 1;
 /// Nothing farther than this is drawn as land, m.
@@ -32,14 +33,12 @@ const SMOOTH_LIGHT_M: f32 = 45.0;
 
 /// Red and blue of a packed colour.
 const RED_BLUE: u32 = 0x00ff_00ff;
-/// Places across, fixed-point, between which every road covers the land wholly: 3.6 of 4 m to either side.
-const PAVED: (i32, i32) = (((HALF_M - 3.6) * ACROSS_UNITS_PER_M) as i32, ((HALF_M + 3.6) * ACROSS_UNITS_PER_M) as i32);
-
-/// A packed colour in `light` of 256; red and blue are computed in one word, green in another.
-#[inline(always)]
-pub(super) fn lit(colour: u32, light: u32) -> u32 {
-    ((((colour & RED_BLUE) * light) >> 8) & RED_BLUE) | (((colour >> 8 & 255) * light) & 0xff00)
-}
+/// Full light.
+pub(super) const FULL: u32 = 256;
+/// Depth and fall of the rays from which the search of the lowest row starts.
+const NEAREST: (f32, f32) = (0.9, -1.0);
+/// Inverse depths below the lowest row.
+const BELOW_PICTURE: [f32; WIDTH] = [1.0 / NEAREST.0; WIDTH];
 
 /// Takes pictures; keeps its buffers from one to the next.
 pub struct Renderer {
@@ -63,6 +62,8 @@ pub(super) struct View<'a> {
     pub(super) camera: &'a Camera,
     /// Grid coordinates of the eye; z is its height.
     eye: Vec3,
+    /// How much the highest land is above the eye, m.
+    rise: f32,
     /// Largest grid coordinates.
     limit: (f32, f32),
     columns: [Column; ANCHORS],
@@ -99,12 +100,22 @@ struct Spot {
     sin: f32,
 }
 
-/// The resolutions that fit the distance of a place, and the air's share of its colour, of 256.
+/// The air between the eye and a place.
+#[derive(Clone, Copy)]
+pub(super) struct Air {
+    /// Share of the place's own colour that comes through, of 256.
+    clear: u32,
+    /// The air's own red and blue, and green, times its share.
+    red_blue: u32,
+    green: u32,
+}
+
+/// The resolutions that fit the distance of a place, and the air before it.
 #[derive(Clone, Copy)]
 struct Levels<'a> {
     road: Level<'a>,
     ground: GroundLevel<'a>,
-    air: u32,
+    air: Air,
 }
 
 /// A place between two spots: on the land, and on the road.
@@ -134,10 +145,11 @@ impl Renderer {
             }
         });
         let limit = (world.terrain.nx as f32 - 1.01, world.terrain.ny as f32 - 1.01);
-        let view = View { world, variant, camera, eye, limit, columns };
+        let rise = world.terrain.highest_m() - eye.z;
+        let view = View { world, variant, camera, eye, rise, limit, columns };
         frame.pixels.resize(WIDTH * HEIGHT * 3, 0);
-        self.march(&view);
-        self.shade(&view, frame);
+        self.march(&view, mount);
+        self.shade(&view, mount, frame);
         objects::draw(&mut self.depths, &view, frame);
         self.bonnet.draw(mount, variant, frame);
     }
@@ -149,12 +161,17 @@ impl Renderer {
 
     /// Finds the depth at every row of the marched columns. Rows are the outer loop: the searches of a row do not depend
     /// on each other, so the processor works on several at once.
-    fn march(&mut self, view: &View) {
-        let mut lasts = [Some((0.9, -1.0)); ANCHORS];
+    fn march(&mut self, view: &View, mount: Mount) {
+        let mut lasts = [Some(NEAREST); ANCHORS];
         for (row, anchors) in self.anchors.chunks_exact_mut(ANCHORS).enumerate().rev() {
+            // Shading looks at the row below too, so only what is hidden in both rows is left out.
+            let hidden = self.bonnet.hidden_spans(mount, row.saturating_sub(1));
             for (k, (anchor, last)) in anchors.iter_mut().zip(&mut lasts).enumerate() {
                 // Above the first ray that meets no land none does.
                 *anchor = 0.0;
+                if hidden.start < k && k < hidden.end {
+                    continue;
+                }
                 if let Some((depth, fall)) = *last {
                     let ray = view.ray(k, row);
                     *last = view.march(ray, depth, fall).map(|hit| (hit, ray.z));
@@ -166,20 +183,28 @@ impl Renderer {
         }
     }
 
-    fn shade(&mut self, view: &View, frame: &mut RgbFrame) {
+    fn shade(&mut self, view: &View, mount: Mount, frame: &mut RgbFrame) {
         let mut spots = [Spot::default(); ANCHORS];
-        for row in 0..HEIGHT {
+        for row in (0..HEIGHT).rev() {
             let inverses = &self.anchors[row * ANCHORS..(row + 1) * ANCHORS];
             let below = &self.anchors[(row + 1).min(HEIGHT - 1) * ANCHORS..][..ANCHORS];
+            let hidden = self.bonnet.hidden_spans(mount, row);
             for (k, spot) in spots.iter_mut().enumerate() {
                 *spot = view.spot(view.ray(k, row), view.columns[k].level, inverses[k]);
             }
-            let pixels = &mut frame.pixels[row * WIDTH * 3..(row + 1) * WIDTH * 3];
-            let depths = &mut self.depths[row * WIDTH..(row + 1) * WIDTH];
+            let (pixels, _) = frame.pixels[row * WIDTH * 3..(row + 1) * WIDTH * 3].as_chunks_mut();
+            let (depths, rest) = self.depths[row * WIDTH..].split_at_mut(WIDTH);
+            let (depths, _) = depths.as_chunks_mut::<SPAN>();
+            let (depths_below, _) = rest.get(..WIDTH).unwrap_or(&BELOW_PICTURE).as_chunks();
             let mut known = spots[0];
             let mut levels = view.levels(&known, (below[0] - known.inverse).abs());
-            for (k, (out, depth)) in pixels.chunks_exact_mut(3 * SPAN).zip(depths.chunks_exact_mut(SPAN)).enumerate() {
+            for (k, (out, depth)) in pixels.as_chunks_mut().0.iter_mut().zip(depths).enumerate() {
                 let (a, b) = (&spots[k], &spots[k + 1]);
+                if hidden.contains(&k) {
+                    // Nearer than anything that might be drawn there.
+                    depth.fill(1.0 / NEAREST.0);
+                    continue;
+                }
                 if a.inverse == 0.0 && b.inverse == 0.0 {
                     depth.fill(0.0);
                     view.shade_sky(row, k, out);
@@ -194,7 +219,7 @@ impl Renderer {
                     }
                     view.shade_span(a, b, lap, &levels, out, depth);
                 } else {
-                    view.shade_each(row, k, a, b, out, depth);
+                    view.shade_each(row, k, &depths_below[k], out, depth);
                 }
             }
         }
@@ -222,17 +247,20 @@ impl View<'_> {
             let even = 1.25 * near * (last_fall / ray.z - 1.0);
             step = if even < step { even.abs() + 0.01 } else { step };
         }
+        // Nothing is above the highest land.
+        let farthest = if ray.z > 0.0 { (self.rise / ray.z).min(FARTHEST_M) } else { FARTHEST_M };
         loop {
             let far = near + step;
             let far_gap = gap(far);
             if far_gap <= 0.0 {
                 return Some(near + step * near_gap / (near_gap - far_gap));
             }
-            if far > FARTHEST_M {
+            if far > farthest {
                 return None;
             }
             (near, near_gap) = (far, far_gap);
-            step = 0.2 + 0.032 * near;
+            // Longer steps where a step's length shows less.
+            step = 0.2 + near * (0.032 + 2e-4 * near);
         }
     }
 
@@ -267,7 +295,7 @@ impl View<'_> {
         spot.across = fixed((across + HALF_M) * ACROSS_UNITS_PER_M);
         spot.cos = ((ray.x * s.tx + ray.y * s.ty) * level).abs();
         spot.sin = ((ray.x * s.ty - ray.y * s.tx) * level).abs();
-        if depth < SMOOTH_LIGHT_M {
+        if depth < SMOOTH_LIGHT_M && (spot.across as u32) < ACROSS_UNITS {
             spot.light = u32::from(self.variant.road_light[fixed(self.world.ground.light(gx, gy)) as usize & 255]);
         }
         spot
@@ -278,7 +306,7 @@ impl View<'_> {
     #[inline(always)]
     fn join(&self, a: &Spot, b: &Spot) -> Option<i32> {
         // The sky has inverse depth 0 and so never joins land.
-        if a.inverse > 1.2 * b.inverse || b.inverse > 1.2 * a.inverse {
+        if a.inverse > 1.25 * b.inverse || b.inverse > 1.25 * a.inverse {
             return None;
         }
         let road = |spot: &Spot| spot.near_road && (spot.across as u32) < ACROSS_UNITS;
@@ -315,40 +343,60 @@ impl View<'_> {
         Levels { road, ground, air: self.air(a.depth) }
     }
 
-    /// Share of the air, of 256, in the colour of a thing at `depth`.
+    /// The air before a thing at `depth`.
     #[inline(always)]
-    pub(super) fn air(&self, depth: f32) -> u32 {
-        fixed(255.0 * depth / (depth + self.world.haze_m)) as u32
+    pub(super) fn air(&self, depth: f32) -> Air {
+        let share = fixed(255.0 * depth / (depth + self.world.haze_m)) as u32;
+        let haze = self.variant.haze;
+        Air { clear: 256 - share, red_blue: (haze & RED_BLUE) * share, green: (haze >> 8 & 255) * share }
     }
 
-    #[inline(always)]
-    fn shade_span(&self, a: &Spot, b: &Spot, lap: i32, levels: &Levels, out: &mut [u8], depths: &mut [f32]) {
-        let (dx, dy) = ((b.x - a.x) / SPAN as i32, (b.y - a.y) / SPAN as i32);
-        let (du, dv) = ((b.along + lap - a.along) / SPAN as i32, (b.across - a.across) / SPAN as i32);
+    /// Colours eight pixels between two marched columns. A function of its own, like the ones below: inlined into one large
+    /// one their loops run out of registers.
+    #[inline(never)]
+    fn shade_span(
+        &self,
+        a: &Spot,
+        b: &Spot,
+        lap: i32,
+        levels: &Levels,
+        out: &mut [[u8; 3]; SPAN],
+        depths: &mut [f32; SPAN],
+    ) {
+        const SPAN_I32: i32 = SPAN as i32;
+        let (dx, dy) = ((b.x - a.x) / SPAN_I32, (b.y - a.y) / SPAN_I32);
         let di = (b.inverse - a.inverse) * (1.0 / SPAN as f32);
+        for (i, depth) in depths.iter_mut().enumerate() {
+            *depth = a.inverse + di * i as f32;
+        }
+        let mut place = Place { x: a.x, y: a.y, along: a.along, across: a.across, light: a.light as i32 * SPAN_I32 };
+        let near_road = a.near_road && b.near_road;
+        let texture = &self.world.textures[a.look as usize];
+        if !near_road || texture.is_beyond(a.across, b.across) {
+            let (ground, air) = (levels.ground, levels.air);
+            for out in out {
+                self.finish(ground.fetch(place.x, place.y), FULL, &air, out);
+                place.x += dx;
+                place.y += dy;
+            }
+            return;
+        }
+        let (du, dv) = ((b.along + lap - a.along) / SPAN_I32, (b.across - a.across) / SPAN_I32);
         // Light where it is known at both ends, in 1/8 of its steps.
         let dl = if a.light != 0 && b.light != 0 { b.light as i32 - a.light as i32 } else { 0 };
-        let mut inverse = a.inverse;
-        for depth in depths {
-            *depth = inverse;
-            inverse += di;
-        }
-        let mut place = Place { x: a.x, y: a.y, along: a.along, across: a.across, light: a.light as i32 * SPAN as i32 };
-        let near_road = a.near_road && b.near_road;
-        let paved = |spot: &Spot| near_road && spot.light != 0 && (PAVED.0..PAVED.1).contains(&spot.across);
-        if paved(a) && paved(b) {
-            // Half of all ground: nothing but the road's own surface.
-            for out in out.chunks_exact_mut(3) {
-                let texel = levels.road.fetch(place.along, place.across as u32);
-                self.finish(lit(texel, place.light as u32 / SPAN as u32), levels.air, out);
+        if a.light != 0 && b.light != 0 && texture.is_paved(a.across) && texture.is_paved(b.across) {
+            let (road, air) = (levels.road, levels.air);
+            for out in out {
+                let texel = road.fetch(place.along, place.across as u32);
+                self.finish(texel, place.light as u32 / SPAN as u32, &air, out);
                 place.along += du;
                 place.across += dv;
                 place.light += dl;
             }
             return;
         }
-        for out in out.chunks_exact_mut(3) {
-            self.put(place, near_road, levels, out);
+        for out in out {
+            self.put(place, true, levels, out);
             place.x += dx;
             place.y += dy;
             place.along += du;
@@ -359,72 +407,84 @@ impl View<'_> {
 
     /// Colours one pixel of ground.
     #[inline(always)]
-    fn put(&self, place: Place, near_road: bool, levels: &Levels, out: &mut [u8]) {
+    fn put(&self, place: Place, near_road: bool, levels: &Levels, out: &mut [u8; 3]) {
         let mut texel = 0;
         if near_road && (place.across as u32) < ACROSS_UNITS {
             texel = levels.road.fetch(place.along, place.across as u32);
         }
-        let (mut light, mut land) = (place.light as u32 / SPAN as u32, 0);
-        if texel >> 24 != 255 || light == 0 {
-            land = levels.ground.fetch(place.x, place.y);
-            if light == 0 {
-                light = u32::from(self.variant.road_light[(land >> 24) as usize]);
-            }
+        let (alpha, mut light) = (texel >> 24, place.light as u32 / SPAN as u32);
+        if alpha == 255 && light != 0 {
+            return self.finish(texel, light, &levels.air, out);
         }
-        let mut colour = lit(texel, light);
-        if texel >> 24 != 255 {
-            let alpha = texel >> 24;
-            let red_blue = ((colour & RED_BLUE) * alpha + (land & RED_BLUE) * (256 - alpha)) >> 8 & RED_BLUE;
-            let green = ((colour >> 8 & 255) * alpha + (land >> 8 & 255) * (256 - alpha)) >> 8;
-            colour = red_blue | green << 8;
+        let land = levels.ground.fetch(place.x, place.y);
+        if light == 0 {
+            light = u32::from(self.variant.road_light[(land >> 24) as usize]);
         }
-        self.finish(colour, levels.air, out);
+        // The land's colours are lit already.
+        let (road, land_share) = (alpha * light >> 8, 256 - alpha);
+        let red_blue = ((texel & RED_BLUE) * road + (land & RED_BLUE) * land_share) >> 8 & RED_BLUE;
+        let green = ((texel >> 8 & 255) * road + (land >> 8 & 255) * land_share) >> 8;
+        self.finish(red_blue | green << 8, FULL, &levels.air, out);
     }
 
-    /// Adds air and the light of the run, and writes the pixel. `colour` is `0x__BBGGRR`.
+    /// Writes a pixel: `colour` (`0x__BBGGRR`) in `light` of 256, seen through the air, in the tone of the run. Red and
+    /// blue are computed in one word, green in another.
     #[inline(always)]
-    pub(super) fn finish(&self, colour: u32, air: u32, out: &mut [u8]) {
-        let (mut red_blue, mut green) = (colour & RED_BLUE, colour >> 8 & 255);
-        if air > 3 {
-            let haze = self.variant.haze;
-            red_blue = (red_blue * (256 - air) + (haze & RED_BLUE) * air) >> 8;
-            green = (green * (256 - air) + (haze >> 8 & 255) * air) >> 8;
-        }
-        let tone = &self.variant.tone;
-        out[0] = tone[0][(red_blue & 255) as usize];
-        out[1] = tone[1][(green & 255) as usize];
-        out[2] = tone[2][(red_blue >> 16 & 255) as usize];
+    pub(super) fn finish(&self, colour: u32, light: u32, air: &Air, out: &mut [u8; 3]) {
+        let share = light * air.clear >> 8;
+        let red_blue = ((colour & RED_BLUE) * share + air.red_blue) >> 8;
+        let green = ((colour >> 8 & 255) * share + air.green) >> 8;
+        self.tone(red_blue, green, out);
     }
 
     #[inline(always)]
-    fn shade_sky(&self, row: usize, k: usize, out: &mut [u8]) {
+    fn tone(&self, red_blue: u32, green: u32, out: &mut [u8; 3]) {
+        let [red, middle, blue] = &self.variant.tone;
+        *out = [red[(red_blue & 255) as usize], middle[(green & 255) as usize], blue[(red_blue >> 16 & 255) as usize]];
+    }
+
+    #[inline(never)]
+    fn shade_sky(&self, row: usize, k: usize, out: &mut [[u8; 3]; SPAN]) {
         let (a, b) = (&self.columns[k], &self.columns[k + 1]);
-        let from = self.ray(k, row).z * a.level;
-        let step = (self.ray(k + 1, row).z * b.level - from) * (1.0 / SPAN as f32);
         let mut turn = b.turn - a.turn;
         if turn.abs() > AROUND as f32 / 2.0 {
             turn -= (AROUND as f32).copysign(turn);
         }
-        for (i, out) in out.chunks_exact_mut(3).enumerate() {
-            let t = i as f32;
-            self.put_sky(a.turn + turn * t * (1.0 / SPAN as f32), from + step * t, out);
+        let mut place = SkyPlace::new(a.turn, self.ray(k, row).z * a.level);
+        let step = place.step_to(SkyPlace::new(a.turn + turn, self.ray(k + 1, row).z * b.level), SPAN as i32);
+        for out in out {
+            self.put_sky(place, out);
+            place = place + step;
         }
     }
 
     #[inline(always)]
-    fn put_sky(&self, turn: f32, tangent: f32, out: &mut [u8]) {
-        self.finish(self.world.sky.fetch(turn, tangent), 0, out);
+    fn put_sky(&self, place: SkyPlace, out: &mut [u8; 3]) {
+        let colour = self.world.sky.fetch(place);
+        self.tone(colour & RED_BLUE, colour >> 8 & 255, out);
     }
 
-    /// Colours eight pixels between which the ground breaks off, each on its own.
-    fn shade_each(&self, row: usize, k: usize, a: &Spot, b: &Spot, out: &mut [u8], depths: &mut [f32]) {
-        let nearest = 0.93 / a.inverse.max(b.inverse);
+    /// Colours eight pixels between which the ground breaks off, each on its own. `below` are the inverse depths of the
+    /// pixels below.
+    #[inline(never)]
+    fn shade_each(
+        &self,
+        row: usize,
+        k: usize,
+        below: &[f32; SPAN],
+        out: &mut [[u8; 3]; SPAN],
+        depths: &mut [f32; SPAN],
+    ) {
         let level = self.columns[k].level;
-        for (i, (out, depth)) in out.chunks_exact_mut(3).zip(depths).enumerate() {
+        for (i, ((out, depth), below)) in out.iter_mut().zip(depths).zip(below).enumerate() {
             let ray = self.ray(k, row) + self.camera.right * (i as f32 / FOCAL_PX);
-            let Some(hit) = self.march(ray, nearest, ray.z - 0.02) else {
+            // Above the sky is only sky.
+            let hit =
+                if *below == 0.0 { None } else { self.march(ray, 1.0 / below, ray.z - self.camera.up.z / FOCAL_PX) };
+            let Some(hit) = hit else {
                 *depth = 0.0;
-                self.put_sky(self.columns[k].turn - i as f32 * AROUND as f32 / 900.0, ray.z * level, out);
+                let turn = self.columns[k].turn - i as f32 * AROUND as f32 / 900.0;
+                self.put_sky(SkyPlace::new(turn, ray.z * level), out);
                 continue;
             };
             *depth = 1.0 / hit;

@@ -4,6 +4,8 @@
 //! than across, so averages are kept for every pair of lengths (a *ripmap*): the picture picks the pair that fits the
 //! pixel, lane lines stay sharp across while the grain along the road is averaged, and nothing flickers.
 
+use std::ops::Range;
+
 use super::math::{hash2, lerp, smoothstep, value_noise};
 use super::spec::{Centre, Edge, Look, Rgb, Surface};
 
@@ -22,6 +24,10 @@ const LEVELS: usize = LOG2_SIZE as usize + 1;
 pub struct RoadTexture {
     texels: Vec<u32>,
     offsets: [[u32; LEVELS]; LEVELS],
+    /// Places across between which there is only road.
+    paved: Range<i32>,
+    /// Places across between which there is any road.
+    covered: Range<i32>,
 }
 
 /// One pair of levels of a ripmap, ready for fetching.
@@ -67,6 +73,7 @@ impl RoadTexture {
             paint_texel(look, along, across, sun, seed)
         };
         let mut level: Vec<u32> = (0..SIZE * SIZE).into_par_iter().map(texel).collect();
+        let (paved, covered) = extent(&level);
         let mut texels = Vec::with_capacity(4 * SIZE * SIZE);
         let mut offsets = [[0; LEVELS]; LEVELS];
         for (i, row) in offsets.iter_mut().enumerate() {
@@ -83,7 +90,19 @@ impl RoadTexture {
                     .collect();
             }
         }
-        RoadTexture { texels, offsets }
+        RoadTexture { texels, offsets, paved, covered }
+    }
+
+    /// Whether the place across shows nothing but road.
+    #[inline(always)]
+    pub fn is_paved(&self, across: i32) -> bool {
+        self.paved.contains(&across)
+    }
+
+    /// Whether both places across are on the land on the same side of the road.
+    #[inline(always)]
+    pub fn is_beyond(&self, a: i32, b: i32) -> bool {
+        a.max(b) < self.covered.start || a.min(b) >= self.covered.end
     }
 
     /// The finest level whose texels are not much smaller than the given lengths, m.
@@ -100,6 +119,28 @@ impl RoadTexture {
             log2_across: LOG2_SIZE - j as u32,
         }
     }
+}
+
+/// Places across, fixed-point, between which a texture covers the land everywhere, and anywhere; with some room for the
+/// wider texels of coarser levels.
+fn extent(texels: &[u32]) -> (Range<i32>, Range<i32>) {
+    const ROOM: usize = SIZE / 64;
+    let (mut least, mut most) = ([255; SIZE], [0; SIZE]);
+    for row in texels.chunks_exact(SIZE) {
+        for ((least, most), texel) in least.iter_mut().zip(&mut most).zip(row) {
+            *least = texel.to_be_bytes()[0].min(*least);
+            *most = texel.to_be_bytes()[0].max(*most);
+        }
+    }
+    let left = least[..SIZE / 2].iter().rposition(|a| *a < 255).map_or(0, |v| v + 1);
+    let right = least[SIZE / 2..].iter().position(|a| *a < 255).map_or(SIZE, |v| v + SIZE / 2);
+    let first = most.iter().position(|a| *a > 0).unwrap_or(SIZE / 2);
+    let last = most.iter().rposition(|a| *a > 0).map_or(SIZE / 2, |v| v + 1);
+    let fixed = |v: usize| (v << ACROSS_BITS) as i32;
+    (
+        fixed(left + ROOM)..fixed(right.saturating_sub(ROOM)),
+        fixed(first.saturating_sub(ROOM))..fixed((last + ROOM).min(SIZE)),
+    )
 }
 
 /// Logarithm to base 2, rounded down and kept within the levels, from the exponent bits of the number.
@@ -122,8 +163,8 @@ pub fn pack(rgb: [f32; 3], alpha: f32) -> u32 {
     byte(rgb[0]) | byte(rgb[1]) << 8 | byte(rgb[2]) << 16 | byte(alpha * 255.0) << 24
 }
 
-const WHITE: [f32; 3] = [214.0, 214.0, 208.0];
-const YELLOW: [f32; 3] = [176.0, 146.0, 42.0];
+const WHITE: [f32; 3] = [232.0, 232.0, 226.0];
+const YELLOW: [f32; 3] = [196.0, 168.0, 50.0];
 
 fn mix(a: [f32; 3], b: [f32; 3], t: f32) -> [f32; 3] {
     std::array::from_fn(|k| lerp(a[k], b[k], t))
@@ -144,19 +185,19 @@ fn paint_texel(look: &Look, along: f32, across: f32, sun: [f32; 3], seed: u32) -
     let edge = if across < 0.0 { look.left } else { look.right };
     let out = across.abs() - HALF_ROAD_M;
     let mut rgb = surface(look, along, across, seed);
-    let wear = 0.75 + 0.5 * grain(along, across, 0.25, 1.0, seed + 5);
+    let wear = (0.85 + 0.4 * grain(along, across, 0.25, 1.0, seed + 5)).min(0.95);
     let painted = match look.centre {
         Centre::None => None,
-        Centre::Dashed => (across.abs() < 0.085 && along.rem_euclid(12.0) < 4.5).then_some(WHITE),
+        Centre::Dashed => (across.abs() < 0.1 && along.rem_euclid(12.0) < 4.5).then_some(WHITE),
         Centre::Solid => (across.abs() < 0.075).then_some(WHITE),
         Centre::Yellow => (across.abs() < 0.07).then_some(YELLOW),
     };
     if let Some(paint) = painted {
-        rgb = mix(rgb, paint, wear.min(0.95));
+        rgb = mix(rgb, paint, wear);
     }
     let line = |at: f32, half: f32| (out + at).abs() < half;
     match edge {
-        Edge::White if line(0.24, 0.08) => rgb = mix(rgb, WHITE, wear),
+        Edge::White if line(0.24, 0.1) => rgb = mix(rgb, WHITE, wear),
         Edge::Yellow | Edge::YellowKerbstone if line(0.42, 0.07) => rgb = mix(rgb, YELLOW, wear),
         Edge::Dashes if line(0.3, 0.08) && along.rem_euclid(3.0) < 1.0 => rgb = mix(rgb, WHITE, wear),
         _ => {}
@@ -165,9 +206,9 @@ fn paint_texel(look: &Look, along: f32, across: f32, sun: [f32; 3], seed: u32) -
     let (kerb_m, kerb) = match edge {
         Edge::Kerb => {
             let red = along.rem_euclid(1.5) < 0.75;
-            (0.95, if red { [198.0, 78.0, 72.0] } else { [226.0, 214.0, 208.0] })
+            (0.95, if red { [214.0, 88.0, 80.0] } else { [236.0, 228.0, 220.0] })
         }
-        Edge::YellowKerbstone => (0.75, [186.0, 182.0, 172.0]),
+        Edge::YellowKerbstone => (0.75, [206.0, 200.0, 186.0]),
         _ => (0.0, [0.0; 3]),
     };
     let ragged = match edge {
@@ -199,7 +240,8 @@ fn surface(look: &Look, along: f32, across: f32, seed: u32) -> [f32; 3] {
         Surface::Patched => {
             let (i, j) = ((along / 4.0).floor(), ((across + HALF_M) / 1.9).floor());
             let patch = if hash2(i as i32, j as i32, seed + 20) < 0.25 { 0.84 } else { 1.0 };
-            let crack = if grain(along, across, 1.3, 1.0, seed + 21).abs() < 0.012 { 0.6 } else { 1.0 };
+            let torn = grain(along, across, 3.0, 1.0, seed + 22) > 0.04;
+            let crack = if torn && grain(along, across, 1.3, 1.0, seed + 21).abs() < 0.01 { 0.65 } else { 1.0 };
             scaled(look.tone, plain * patch * crack)
         }
         Surface::Cobble => {

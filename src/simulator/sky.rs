@@ -68,11 +68,45 @@ impl Sky {
         Sky { texels }
     }
 
-    /// The texel in the direction `around` (in texels, any value) with the given tangent of the elevation.
+    /// The texel at a place.
     #[inline(always)]
-    pub fn fetch(&self, around: f32, tangent: f32) -> u32 {
-        let i = fixed(around) as usize & (AROUND - 1);
-        let j = fixed(clip((tangent - LOWEST) * PER_TANGENT, UP as f32 - 1.0)) as usize;
-        self.texels[j * AROUND + i]
+    pub fn fetch(&self, place: SkyPlace) -> u32 {
+        let i = (place.around >> FRACTION_BITS) as usize & (AROUND - 1);
+        self.texels[(place.up >> FRACTION_BITS) as usize * AROUND + i]
+    }
+}
+
+/// Bits behind the point of a [`SkyPlace`].
+const FRACTION_BITS: u32 = 9;
+
+/// A place on the picture, or the way between two, in fixed-point texels.
+#[derive(Clone, Copy)]
+pub struct SkyPlace {
+    around: i32,
+    up: i32,
+}
+
+impl SkyPlace {
+    /// The direction `around` (in texels, any value below 2^13) with the given tangent of the elevation.
+    #[inline(always)]
+    pub fn new(around: f32, tangent: f32) -> SkyPlace {
+        let one = (1 << FRACTION_BITS) as f32;
+        let up = clip((tangent - LOWEST) * PER_TANGENT, UP as f32 - 1.0);
+        SkyPlace { around: fixed((around + 0.5) * one), up: fixed((up + 0.5) * one) }
+    }
+
+    /// One of `parts` equal steps from here to `other`.
+    #[inline(always)]
+    pub fn step_to(self, other: SkyPlace, parts: i32) -> SkyPlace {
+        SkyPlace { around: (other.around - self.around) / parts, up: (other.up - self.up) / parts }
+    }
+}
+
+impl std::ops::Add for SkyPlace {
+    type Output = SkyPlace;
+
+    #[inline(always)]
+    fn add(self, way: SkyPlace) -> SkyPlace {
+        SkyPlace { around: self.around + way.around, up: self.up + way.up }
     }
 }

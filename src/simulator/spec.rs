@@ -30,6 +30,98 @@ pub struct TrackSpec {
     pub light: Light,
 }
 
+impl TrackSpec {
+    /// Checks all that can be told without the line itself.
+    ///
+    /// # Errors
+    /// A sentence that names the entry, what it must be, and the remedy.
+    pub(super) fn check(&self) -> Result<(), String> {
+        self.check_points()?;
+        within("min_radius_m", self.min_radius_m, 15.0, 200.0)?;
+        if self.look.is_empty() {
+            return Err("look: at least one [[look]] is needed".to_string());
+        }
+        for look in &self.look {
+            let at = |key: &str| format!("look `{}`: {key}", look.name);
+            within(&at("grain"), look.grain.into(), 0.0, 1.0)?;
+            within(&at("shoulder_m"), look.shoulder_m.into(), 0.0, 3.5)?;
+        }
+        let (land, light) = (&self.land, &self.light);
+        for (name, value, low, high) in [
+            ("land: hills_m", f64::from(land.hills_m), 0.0, 200.0),
+            ("land: plants_per_100_m", land.plants_per_100_m.into(), 0.0, 100.0),
+            ("land: plants_from_m", land.plants_from_m.into(), 0.5, 60.0),
+            ("light: sun_azimuth_deg", light.sun_azimuth_deg, -360.0, 360.0),
+            ("light: sun_elevation_deg", light.sun_elevation_deg, 5.0, 85.0),
+            ("light: shade", light.shade.into(), 0.1, 1.0),
+            ("light: haze_m", light.haze_m.into(), 10.0, 1e5),
+            ("light: clouds", light.clouds.into(), 0.0, 1.0),
+        ] {
+            within(name, value, low, high)?;
+        }
+        Ok(())
+    }
+
+    fn check_points(&self) -> Result<(), String> {
+        let points = &self.points;
+        if points.len() < 6 {
+            return Err(format!("points: {} given, a closed line needs at least 6", points.len()));
+        }
+        if let Some(i) = points.iter().position(|p| p.iter().any(|v| !v.is_finite() || v.abs() > 1e5)) {
+            return Err(format!("points[{i}]: every number must be finite and below 100,000"));
+        }
+        // Way from each point to the next; from the last one back to the first.
+        let gap_m = |i: usize| {
+            let (a, b) = (points[i], points[(i + 1) % points.len()]);
+            ((a[0] - b[0]) * (a[0] - b[0]) + (a[1] - b[1]) * (a[1] - b[1])).sqrt()
+        };
+        let last = points.len() - 1;
+        if gap_m(last) < 1.0 {
+            return Err(format!(
+                "points[{last}] is where points[0] is; the line closes by itself, so leave the last point out"
+            ));
+        }
+        if let Some(i) = (0..last).find(|i| gap_m(*i) < 1.0) {
+            return Err(format!("points[{i}] and points[{}] are at the same place; leave one out", i + 1));
+        }
+        let widest_m = (0..last).map(gap_m).fold(0.0, f64::max);
+        if gap_m(last) > 3.0 * widest_m {
+            return Err(format!(
+                "the line is not closed: from points[{last}] back to points[0] it is {:.0} m, elsewhere at most \
+                 {widest_m:.0} m from point to point; add points on the way back",
+                gap_m(last)
+            ));
+        }
+        Ok(())
+    }
+
+    /// Checks the stretches of a lap of `length_m`.
+    ///
+    /// # Errors
+    /// As [`check`](Self::check).
+    pub(super) fn check_stretches(&self, length_m: f64) -> Result<(), String> {
+        for stretch in &self.stretch {
+            let at = format!("stretch from {} m", stretch.from_m);
+            for place in [stretch.from_m, stretch.to_m] {
+                if !(0.0..=length_m).contains(&place) {
+                    return Err(format!("{at}: {place} m is not on the lap of {length_m:.0} m"));
+                }
+            }
+            if let Some(name) = stretch.look.as_ref().filter(|name| !self.look.iter().any(|l| l.name == **name)) {
+                let known: Vec<&str> = self.look.iter().map(|l| l.name.as_str()).collect();
+                return Err(format!("{at}: no [[look]] is called `{name}`; there are {}", known.join(", ")));
+            }
+        }
+        Ok(())
+    }
+}
+
+fn within(name: &str, value: f64, low: f64, high: f64) -> Result<(), String> {
+    // Numbers kept in 32 bits have digits behind those that were written.
+    let written = (value * 1e6).round() / 1e6;
+    if (low..=high).contains(&written) { Ok(()) } else { Err(format!("{name} is {written}; {low} to {high} is meant")) }
+}
+
 fn default_min_radius_m() -> f64 {
     25.0
 }

@@ -25,6 +25,7 @@ pub struct Terrain {
     /// Grid points from south to north.
     pub ny: usize,
     heights: Vec<f32>,
+    highest_m: f32,
     stations: Vec<u16>,
 }
 
@@ -93,7 +94,8 @@ impl Terrain {
         let (x0, y0) = ((x_min - MARGIN_M).floor(), (y_min - MARGIN_M).floor());
         let (nx, ny) = ((x_max + MARGIN_M - x0) as usize + 2, (y_max + MARGIN_M - y0) as usize + 2);
         let stations = nearest_stations(track, x0, y0, nx, ny);
-        let mut terrain = Terrain { x0: x0 as f32, y0: y0 as f32, nx, ny, heights: vec![0.0; nx * ny], stations };
+        let (x0, y0, heights) = (x0 as f32, y0 as f32, vec![0.0; nx * ny]);
+        let mut terrain = Terrain { x0, y0, nx, ny, heights, highest_m: 0.0, stations };
         terrain.raise(track);
         terrain
     }
@@ -138,6 +140,7 @@ impl Terrain {
         if let Some(level) = land.water_level_m {
             self.heights.iter_mut().for_each(|h| *h = h.max(level));
         }
+        self.highest_m = self.heights.iter().copied().fold(f32::MIN, f32::max);
     }
 
     /// Height of the land at grid coordinates (metres east and north of the grid's corner), interpolated.
@@ -150,6 +153,11 @@ impl Terrain {
         let a = low[0] + (low[1] - low[0]) * fx;
         let b = high[0] + (high[1] - high[0]) * fx;
         a + (b - a) * fy
+    }
+
+    /// Height of the highest land, m.
+    pub fn highest_m(&self) -> f32 {
+        self.highest_m
     }
 
     /// Height of the land at a point of the world, m.
@@ -315,11 +323,18 @@ impl GroundMap {
         texels.par_chunks_mut(nx).enumerate().for_each(|(j, row)| {
             for (i, texel) in row.iter_mut().enumerate() {
                 let (gx, gy) = (i as f32 * 0.5, j as f32 * 0.5);
-                let cell = (j / 2) * terrain.nx + i / 2;
-                let (brightness, up) = lit[cell];
+                // The middle of a texel lies a quarter of the way to one of the grid points around it.
+                let (fx, fy) = (0.25 + 0.5 * (i % 2) as f32, 0.25 + 0.5 * (j % 2) as f32);
+                let (west, south) = (i / 2, (j / 2) * terrain.nx);
+                let (east, north) = ((west + 1).min(terrain.nx - 1), (j / 2 + 1).min(terrain.ny - 1) * terrain.nx);
+                let smooth = |value: &dyn Fn(usize) -> f32| {
+                    let low = lerp(value(south + west), value(south + east), fx);
+                    lerp(low, lerp(value(north + west), value(north + east), fx), fy)
+                };
+                let (brightness, up) = (smooth(&|cell| lit[cell].0), smooth(&|cell| lit[cell].1));
                 let through = f32::from(shadow[j * nx + i]) / 255.0;
                 let brightness = light.shade * 0.9 + (brightness - light.shade * 0.9) * through;
-                let height = terrain.heights[cell];
+                let height = smooth(&|cell| terrain.heights[cell]);
                 let patches = value_noise(gx / 9.0, gy / 9.0, None, land.seed + 10);
                 let tufts = value_noise(gx / 1.3, gy / 1.3, None, land.seed + 11);
                 let grain = hash2(i as i32, j as i32, land.seed + 12);
@@ -328,8 +343,10 @@ impl GroundMap {
                     std::array::from_fn(|k| lerp(tone(land.ground[0])[k], tone(land.ground[1])[k], mixing));
                 let steep = smoothstep(0.86, 0.62, up + 0.14 * (tufts - 0.5));
                 let shade = 0.78 + 0.28 * tufts + 0.18 * grain;
-                let rocky =
-                    0.6 + 0.55 * value_noise(gx / 2.1, height / 1.4 + gy / 5.0, None, land.seed + 13) + 0.2 * grain;
+                // Seen from the side of a rock face, what is painted from above runs down in streaks.
+                let streaks = value_noise(gx / 0.9, gy / 0.9, None, land.seed + 14);
+                let layers = value_noise(gx / 2.1, height / 1.4 + gy / 5.0, None, land.seed + 13);
+                let rocky = 0.45 + 0.4 * layers + 0.5 * streaks + 0.2 * grain;
                 let mut glare = 1.0;
                 for (k, c) in rgb.iter_mut().enumerate() {
                     *c = lerp(*c * shade, tone(land.rock)[k] * rocky, steep);

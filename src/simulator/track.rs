@@ -99,37 +99,37 @@ impl Track {
     /// # Errors
     /// As [`from_spec`](Track::from_spec), and anything that is no track file.
     pub fn from_toml(text: &str, place: &str) -> Result<Track> {
-        let spec: TrackSpec =
-            toml::from_str(text).map_err(|e| Error::Data { place: place.to_string(), message: e.to_string() })?;
+        let spec: TrackSpec = toml::from_str(text).map_err(|e| {
+            let before = e.span().and_then(|span| text.get(..span.start)).unwrap_or_default();
+            Error::data_at(place, 1 + before.matches('\n').count() as u64, e.message())
+        })?;
         Track::from_spec(spec, place)
     }
 
     /// Builds and checks a track; `place` names it in errors.
     ///
     /// # Errors
-    /// Fewer than 6 points, a lap outside 600-1,500 m, a bend tighter than allowed, a slope above 20 %, a width outside
-    /// 5-14 m, a bank above 10 degrees, parts of the road closer together than 14 m between edges, an unknown look.
+    /// Fewer than 6 points, a line that is not closed, a lap outside 600-1,500 m, a bend tighter than allowed, a slope above
+    /// 20 %, a width outside 5-14 m, a bank above 10 degrees, parts of the road closer together than 14 m between edges, an
+    /// unknown look, a number outside its range.
     pub fn from_spec(spec: TrackSpec, place: &str) -> Result<Track> {
         let fail = |message: String| Err(Error::Data { place: place.to_string(), message });
-        if spec.points.len() < 6 {
-            return fail(format!("points: {} given, a closed line needs at least 6", spec.points.len()));
-        }
-        if spec.points.iter().flatten().any(|v| !v.is_finite() || v.abs() > 1e5) {
-            return fail("points: every number must be finite and below 100,000".to_string());
-        }
-        if spec.look.is_empty() {
-            return fail("look: at least one [[look]] is needed".to_string());
-        }
-        for stretch in &spec.stretch {
-            if let Some(name) = &stretch.look
-                && !spec.look.iter().any(|l| &l.name == name)
-            {
-                return fail(format!("stretch from {} m: no [[look]] is called `{name}`", stretch.from_m));
-            }
+        if let Err(message) = spec.check() {
+            return fail(message);
         }
         let (stations, length_m) = stations_of(&spec.points);
         if !(600.0..=1500.0).contains(&length_m) {
             return fail(format!("the lap is {length_m:.0} m long; 600 to 1500 m are allowed, so scale the points"));
+        }
+        if let Err(message) = spec.check_stretches(length_m) {
+            return fail(message);
+        }
+        let lowest_m = stations.iter().map(|s| s.z).fold(f64::MAX, f64::min);
+        if let Some(level) = spec.land.water_level_m.filter(|level| f64::from(*level) > lowest_m - 0.5) {
+            let highest = lowest_m - 0.5;
+            return fail(format!(
+                "land: water_level_m {level} would flood the road; at most {highest:.1}, or leave it out"
+            ));
         }
         let track = Track { spec, stations, length_m, world: OnceLock::new() };
         track.check_stations(place)?;
@@ -143,8 +143,10 @@ impl Track {
             let at = self.s_of(i);
             let message = if station.curvature.abs() * smallest > 1.0 {
                 let radius = 1.0 / station.curvature.abs();
+                let point = self.nearest_point(station);
                 format!(
-                    "radius {radius:.1} m at {at:.0} m of the lap; at least {smallest:.0} m, so spread the points there"
+                    "the road turns too tightly: radius {radius:.1} m at {at:.0} m of the lap, near points[{point}]; at least \
+                     {smallest:.0} m, so move the points there apart"
                 )
             } else if station.slope.abs() > 0.2 {
                 format!("slope {:.0} % at {at:.0} m of the lap; at most 20 %", station.slope * 100.0)
@@ -160,6 +162,13 @@ impl Track {
         Ok(())
     }
 
+    /// Index of the control point nearest to a station.
+    fn nearest_point(&self, station: &Station) -> usize {
+        let square = |p: &[f64; 5]| (p[0] - station.x) * (p[0] - station.x) + (p[1] - station.y) * (p[1] - station.y);
+        let points = self.spec.points.iter().enumerate();
+        points.min_by(|a, b| square(a.1).total_cmp(&square(b.1))).map_or(0, |(i, _)| i)
+    }
+
     /// The road must not cross itself or pass close to itself: the land between has one height everywhere.
     fn check_distances(&self, place: &str) -> Result<()> {
         let n = self.stations.len();
@@ -173,11 +182,12 @@ impl Track {
                 if apart > 1.7 * clear && dx * dx + dy * dy < clear * clear {
                     let (at_a, at_b) = (self.s_of(i), self.s_of(j));
                     let gap = (dx * dx + dy * dy).sqrt();
+                    let (p, q) = (self.nearest_point(a), self.nearest_point(b));
                     return Err(Error::Data {
                         place: place.to_string(),
                         message: format!(
-                            "the road crosses or touches itself: {at_a:.0} m and {at_b:.0} m of the lap are {gap:.1} m apart; \
-                             keep {clear:.0} m"
+                            "the road crosses or touches itself: {at_a:.0} m and {at_b:.0} m of the lap are {gap:.1} m apart, \
+                             near points[{p}] and points[{q}]; keep {clear:.0} m"
                         ),
                     });
                 }

@@ -284,25 +284,26 @@ fn shadows(track: &Track, terrain: &Terrain, sprites: &[Sprite], kinds: &[Plant]
     let run = 1.0 / sun.z.max(0.1);
     let seed = track.spec.land.seed;
     for sprite in sprites {
-        // Height of the crown's middle, its radius, and how dense it is.
-        let (height, radius, dense) = match kinds[sprite.picture] {
-            Plant::Pine => (8.0, 2.2, 0.75),
-            Plant::Broadleaf => (4.8, 2.8, 0.85),
-            Plant::Palm => (5.0, 2.3, 0.6),
-            Plant::Bush => (0.5, 1.1, 0.7),
-            Plant::Cypress => (4.0, 1.1, 0.9),
-            Plant::Fir => (5.0, 2.4, 0.85),
-            Plant::Birch => (7.5, 2.2, 0.6),
-            Plant::Boulder => (0.8, 1.6, 0.9),
-            Plant::Board => (2.3, 0.5, 0.9),
+        // Height of the crown's middle, its radius, half its height, and how dense it is.
+        let (height, radius, half, dense) = match kinds[sprite.picture] {
+            Plant::Pine => (7.6, 1.7, 2.9, 0.75),
+            Plant::Broadleaf => (4.6, 2.6, 2.6, 0.85),
+            Plant::Palm => (5.0, 2.3, 0.9, 0.6),
+            Plant::Bush => (0.5, 1.1, 0.6, 0.7),
+            Plant::Cypress => (4.2, 0.8, 4.2, 0.9),
+            Plant::Fir => (5.6, 1.8, 5.6, 0.85),
+            Plant::Birch => (7.4, 1.7, 2.8, 0.6),
+            Plant::Boulder => (0.7, 1.4, 0.8, 0.9),
+            Plant::Board => (2.3, 0.5, 0.3, 0.9),
             Plant::Post => continue,
         };
-        let (height, radius) = (height * sprite.scale, radius * sprite.scale);
+        let (height, radius, half) = (height * sprite.scale, radius * sprite.scale, half * sprite.scale);
         let (cx, cy) = (sprite.foot.x - sun.x * run * height, sprite.foot.y - sun.y * run * height);
-        // The shadow of a ball: an ellipse, longer away from the sun.
+        // The shadow of an upright ellipsoid: an ellipse, longer away from the sun.
         let flat = (sun.x * sun.x + sun.y * sun.y).sqrt().max(1e-3);
         let (ux, uy) = (sun.x / flat, sun.y / flat);
-        let long = radius * run.min(3.0);
+        let fall = half * (run * flat).min(3.0);
+        let long = (radius * radius + fall * fall).sqrt();
         let reach = (long * 1.3 * 2.0) as i32 + 2;
         let (ci, cj) = (((cx - terrain.x0) * 2.0) as i32, ((cy - terrain.y0) * 2.0) as i32);
         for j in (cj - reach).max(0)..(cj + reach).min(ny as i32) {

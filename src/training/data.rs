@@ -63,6 +63,16 @@ impl Data {
         &self.notices
     }
 
+    /// The recordings, in the order of the command line.
+    pub fn recordings(&self) -> &[Recording] {
+        &self.recordings
+    }
+
+    /// Both sides.
+    pub fn split(&self) -> &Split {
+        &self.split
+    }
+
     /// Share of validation rows with a training row of the same session within a second, in percent.
     pub fn leak_percent(&self) -> f64 {
         100.0 * self.leak.share()

@@ -46,3 +46,46 @@ pub fn write_history(path: &Path, history: &[EpochRecord]) -> Result<()> {
     let bytes = writer.into_inner().map_err(|e| Error::data(path, e.to_string()))?;
     atomic_file::write(path, &bytes)
 }
+
+/// Reads what [`write_history`] wrote.
+///
+/// # Errors
+///
+/// [`Error::Io`], and [`Error::Data`] with the line that is wrong.
+pub fn read_history(path: &Path) -> Result<Vec<EpochRecord>> {
+    let bytes = std::fs::read(path).map_err(Error::io(path))?;
+    let mut history = Vec::new();
+    for record in csv::Reader::from_reader(&bytes[..]).deserialize() {
+        let line = history.len() as u64 + 2;
+        history.push(record.map_err(|e: csv::Error| Error::data_at(path, line, e.to_string()))?);
+    }
+    Ok(history)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_history_comes_back_as_it_was_and_a_damaged_one_is_an_error_with_its_line() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("history.csv");
+        let record = EpochRecord {
+            epoch: 1,
+            train_loss: 0.1 + 0.2,
+            val_mse: Some(1.0 / 3.0),
+            val_center_mse: None,
+            val_mae_deg: None,
+            relative_to_zero: None,
+            learning_rate: 1e-3,
+            images: 7,
+            train_seconds: 1.5,
+            seconds: 2.0,
+        };
+        let history = [record, EpochRecord { epoch: 2, ..record }];
+        write_history(&path, &history).unwrap();
+        assert_eq!(read_history(&path).unwrap(), history);
+        std::fs::write(&path, std::fs::read_to_string(&path).unwrap().replace("\n2,", "\nx,")).unwrap();
+        assert!(read_history(&path).unwrap_err().to_string().contains("history.csv:3:"));
+    }
+}

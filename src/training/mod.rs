@@ -9,6 +9,7 @@
 //! | `model.safetensors` | the best model, by validation loss |
 //! | `last.safetensors` | the model of the last epoch; with early stopping, in the end the best one |
 //! | `checkpoint.safetensors` | where the run stands |
+//! | `report.html` | the run in pictures; see [`crate::report::run`] |
 //! | `result.json` | what `train --json` prints; its presence says that the run is finished |
 
 mod checkpoint;
@@ -21,7 +22,7 @@ mod validation;
 pub use crate::loss::Loss;
 pub use checkpoint::{Progress, State};
 pub use data::Data;
-pub use history::{EpochRecord, write_history};
-pub use run_folder::RunFolder;
+pub use history::{EpochRecord, read_history, write_history};
+pub use run_folder::{RunFolder, RunInfo};
 pub use session::{Observer, TrainRequest, TrainResult, resume, train};
 pub use validation::{Validation, ValidationResult};

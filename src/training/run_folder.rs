@@ -5,6 +5,8 @@ use std::path::{Path, PathBuf};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
+use super::history::{EpochRecord, read_history};
+use super::session::TrainResult;
 use crate::atomic_file;
 use crate::error::{Error, Result};
 use crate::recipe::Recipe;
@@ -34,13 +36,17 @@ pub struct RunInfo {
 }
 
 impl RunFolder {
+    /// Name of the file in which the main job notes what follows on the training. It may be there before a run begins.
+    pub const JOB_NOTE: &str = "main-job.json";
+
     /// A new run in `path`, which must not exist or be empty.
     ///
     /// # Errors
     ///
     /// [`Error::Usage`] if there is something in it already, [`Error::Io`] if it cannot be made.
     pub fn create(path: &Path) -> Result<RunFolder> {
-        if path.exists() && std::fs::read_dir(path).map_err(Error::io(path))?.next().is_some() {
+        let taken = |entry: std::io::Result<std::fs::DirEntry>| entry.is_ok_and(|e| e.file_name() != Self::JOB_NOTE);
+        if path.exists() && std::fs::read_dir(path).map_err(Error::io(path))?.any(taken) {
             return Err(Error::Usage(format!(
                 "{} is not empty and stays as it is; give another folder with --out, or go on with that run: --resume {}",
                 path.display(),
@@ -69,6 +75,15 @@ impl RunFolder {
         (1..).map(|n| Path::new("runs").join(format!("{name}-{n}"))).find(|path| !path.exists()).expect("numbers go on")
     }
 
+    /// How the run was begun.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Io`] and [`Error::Data`] for a damaged folder.
+    pub fn info(&self) -> Result<RunInfo> {
+        self.read_json("run.json")
+    }
+
     /// A file in the folder.
     pub fn file(&self, name: &str) -> PathBuf {
         self.path.join(name)
@@ -79,13 +94,40 @@ impl RunFolder {
         self.file("model.safetensors")
     }
 
+    /// The recipe of the run.
+    ///
+    /// # Errors
+    ///
+    /// As [`Recipe::find`].
+    pub fn recipe(&self) -> Result<Recipe> {
+        Recipe::find(&self.file("recipe.toml").display().to_string(), &[])
+    }
+
+    /// The epochs that are done.
+    ///
+    /// # Errors
+    ///
+    /// As [`read_history`].
+    pub fn history(&self) -> Result<Vec<EpochRecord>> {
+        read_history(&self.file("history.csv"))
+    }
+
+    /// What the run came to; `None` while it is not finished.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Io`] and [`Error::Data`].
+    pub fn result(&self) -> Result<Option<TrainResult>> {
+        if self.file("result.json").is_file() { self.read_json("result.json").map(Some) } else { Ok(None) }
+    }
+
     pub(super) fn write_json(&self, name: &str, value: &impl Serialize) -> Result<()> {
         let path = self.file(name);
         let text = serde_json::to_string_pretty(value).map_err(|e| Error::data(&path, e.to_string()))?;
         atomic_file::write(&path, (text + "\n").as_bytes())
     }
 
-    pub(super) fn read_json<T: DeserializeOwned>(&self, name: &str) -> Result<T> {
+    fn read_json<T: DeserializeOwned>(&self, name: &str) -> Result<T> {
         let path = self.file(name);
         let text = std::fs::read_to_string(&path).map_err(Error::io(&path))?;
         serde_json::from_str(&text).map_err(|e| Error::data_at(&path, e.line() as u64, e.to_string()))
@@ -93,10 +135,6 @@ impl RunFolder {
 
     pub(super) fn write_recipe(&self, recipe: &Recipe) -> Result<()> {
         atomic_file::write(&self.file("recipe.toml"), recipe.to_toml()?.as_bytes())
-    }
-
-    pub(super) fn read_recipe(&self) -> Result<Recipe> {
-        Recipe::find(&self.file("recipe.toml").display().to_string(), &[])
     }
 }
 

@@ -17,7 +17,7 @@ use crate::error::{Error, Result};
 use crate::model_file::{Model, TrainingRecord, weights_hash};
 use crate::network::{Network, StepInput, TrainingPlan};
 use crate::optimizer::Optimizer;
-use crate::recipe::Recipe;
+use crate::recipe::{Keep, Recipe};
 
 /// Most images of one row: three cameras, each mirrored. A batch of whole rows has at least one row.
 const IMAGES_OF_A_ROW: usize = 6;
@@ -41,8 +41,8 @@ pub struct TrainRequest {
 pub trait Observer {
     /// Something the user should know.
     fn notice(&mut self, text: &str);
-    /// Images of epoch `epoch` (from 1) that are done, of how many.
-    fn progress(&mut self, epoch: u32, images: usize, of: usize);
+    /// Images of epoch `epoch` (from 1) that are done, of how many, and the mean loss of the last batch.
+    fn progress(&mut self, epoch: u32, images: usize, of: usize, loss: f64);
     /// An epoch is done, of how many.
     fn epoch(&mut self, record: &EpochRecord, of: u32);
 }
@@ -51,11 +51,11 @@ pub trait Observer {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TrainResult {
-    /// Path of the best model.
+    /// Path of the model: the weights of the best epoch, or of the last one if the recipe keeps that.
     pub model: PathBuf,
     /// Epochs done.
     pub epochs: u32,
-    /// The epoch of the best model, from 1.
+    /// The epoch of the model, from 1; "best" below is this one.
     pub best_epoch: u32,
     /// Mean loss over the last epoch's training batches.
     pub train_mse: f64,
@@ -115,13 +115,12 @@ pub fn train(request: TrainRequest, observer: &mut dyn Observer, stop: &AtomicBo
 pub fn resume(path: &Path, observer: &mut dyn Observer, stop: &AtomicBool) -> Result<TrainResult> {
     let started = Instant::now();
     let folder = RunFolder::open(path)?;
-    if folder.file("result.json").is_file() {
+    if let Some(result) = folder.result()? {
         observer.notice("this run is finished; here is its result again");
-        let result: TrainResult = folder.read_json("result.json")?;
         return Ok(TrainResult { model: folder.model(), ..result });
     }
-    let info: RunInfo = folder.read_json("run.json")?;
-    let recipe = folder.read_recipe()?;
+    let info = folder.info()?;
+    let recipe = folder.recipe()?;
     let isa = Isa::best().name();
     if info.isa != isa {
         observer.notice(&format!(
@@ -273,7 +272,7 @@ impl Session {
             progress.images += current.n;
             progress.next_batch = following;
             progress.train_seconds = seconds_of_epoch_before + started.elapsed().as_secs_f64();
-            observer.progress(epoch + 1, progress.images, training.samples());
+            observer.progress(epoch + 1, progress.images, training.samples(), mean_loss);
             std::mem::swap(current, next);
             if stop.load(Ordering::Relaxed) {
                 self.state.progress.seconds = seconds_before + self.started.elapsed().as_secs_f64();
@@ -310,9 +309,9 @@ impl Session {
         progress.epoch += 1;
         (progress.next_batch, progress.loss_sum, progress.images, progress.train_seconds) = (0, 0.0, 0, 0.0);
 
-        // Without a validation side the latest weights are the best there are.
+        // Without a validation side the latest weights are the best there are; so they are if the recipe says so.
         let better = match (record.val_mse, progress.best_val_mse) {
-            (Some(now), Some(before)) => now < before,
+            (Some(now), Some(before)) => now < before || self.recipe.keep == Keep::Last,
             _ => true,
         };
         if better {

@@ -6,17 +6,34 @@
 //! one chain of multiply-adds in the order of the taps, whatever the tile it falls in, so it does not depend on the
 //! number of images.
 
+use std::ops::Range;
+
 use super::grid::Span;
 use crate::simd::Simd;
 
-/// Taps that all channels go through before the next: the input they touch, 1.3 to 1.6 cache lines each, then stays in
-/// the first-level cache. Between blocks the sums wait in the output.
-const BLOCK_TAPS: usize = 240;
+/// The weights of a block of taps, all channels together: half of a 32 KiB first-level cache. All positions of an image
+/// go through a block before the next, so that its weights stay there; between blocks the sums wait in the output.
+const BLOCK_WEIGHTS: usize = 4096;
+/// Bounds of a block: enough work between reading a sum and writing it, and input of 1.3 to 1.6 cache lines a tap that
+/// fits into the other half.
+const BLOCK_TAPS: (usize, usize) = (48, 240);
+
+/// Elements of input, 128 KiB, that go through all blocks of taps before the next.
+const GROUP_INPUT: usize = 32_768;
 
 /// Output channels of a tile for `channels` in all: the height that leaves the fewest rows empty.
 fn tile_height(many_registers: bool, channels: usize) -> usize {
     let heights: &[usize] = if many_registers { &[8, 6, 4] } else { &[6, 4] };
     *heights.iter().min_by_key(|&&height| channels.div_ceil(height) * height).unwrap_or(&4)
+}
+
+/// Positions that are computed from the same taps.
+#[derive(Clone, Debug)]
+pub(crate) struct Band {
+    /// Which of the spans.
+    pub spans: Range<usize>,
+    /// Which of the taps; the others would multiply zeros.
+    pub taps: Range<usize>,
 }
 
 /// `out[o][p] = bias[o] + sum over k of weight[o][k] * x[start(p) + taps[k]]`, for each image.
@@ -27,8 +44,10 @@ pub(crate) struct TapSum {
     /// Where the weight of each tap is for channel 0, and how far apart channels are.
     pub weights: Vec<usize>,
     pub weight_stride: usize,
-    /// The positions of one image.
+    /// The positions of one image, in ascending order.
     pub spans: Vec<Span>,
+    /// The spans cut into bands.
+    pub bands: Vec<Band>,
     /// Where the first window begins in an input image.
     pub origin: usize,
     /// Elements of an input image.
@@ -94,6 +113,10 @@ impl TapSum {
             assert!(span.out + span.lanes.count_ones() as usize <= self.plane, "tap sum: output too short");
             assert!(span.lanes != 0 && span.reach() <= S::LANES, "tap sum: a span is wider than a vector");
         }
+        for band in &self.bands {
+            let ends = band.spans.end <= self.spans.len() && band.taps.end <= self.taps.len();
+            assert!(ends && !band.spans.is_empty(), "tap sum: a band of spans or taps that do not exist");
+        }
     }
 
     #[inline(always)]
@@ -103,45 +126,61 @@ impl TapSum {
         let panel_len = MR * (self.taps.len() + 1);
         assert!(packed.len() >= self.channels.div_ceil(MR) * panel_len, "tap sum: packed weights are too short");
         let farthest = self.farthest();
-        let total = images * self.spans.len();
         let tile_vectors = if S::MANY_REGISTERS { 3 } else { 2 };
-        let mut next = 0;
-        while next < total {
-            let count = (total - next).min(tile_vectors);
-            // SAFETY: `check` holds for every image, and tiles are asked for only existing vectors.
-            unsafe {
-                match count {
-                    3 if S::MANY_REGISTERS => self.column::<S, MR, 3>(simd, next, farthest, x, packed, y),
-                    2 => self.column::<S, MR, 2>(simd, next, farthest, x, packed, y),
-                    _ => self.column::<S, MR, 1>(simd, next, farthest, x, packed, y),
+        let most_taps = (BLOCK_WEIGHTS / self.channels).clamp(BLOCK_TAPS.0, BLOCK_TAPS.1);
+        for band in &self.bands {
+            let blocks = band.taps.len().div_ceil(most_taps).max(1);
+            let block = band.taps.len().div_ceil(blocks);
+            // Tiles may span images, so that few vectors are left over; but what goes through several blocks should
+            // stay in the cache meanwhile.
+            let group = if blocks == 1 { images } else { (GROUP_INPUT / self.in_image).clamp(1, images) };
+            for first_image in (0..images).step_by(group) {
+                for number in 0..blocks {
+                    let first_tap = band.taps.start + number * block;
+                    let taps = first_tap..(first_tap + block).min(band.taps.end);
+                    let end = group.min(images - first_image) * band.spans.len();
+                    let mut next = 0;
+                    while next < end {
+                        let place = Place { band, first_image, next, taps: taps.clone(), begins: number == 0 };
+                        let count = (end - next).min(tile_vectors);
+                        // SAFETY: `check` holds for every image, and tiles are asked for only existing vectors.
+                        unsafe {
+                            match count {
+                                3 if S::MANY_REGISTERS => self.column::<S, MR, 3>(simd, place, farthest, x, packed, y),
+                                2 => self.column::<S, MR, 2>(simd, place, farthest, x, packed, y),
+                                _ => self.column::<S, MR, 1>(simd, place, farthest, x, packed, y),
+                            }
+                        }
+                        next += count;
+                    }
                 }
             }
-            next += count;
         }
     }
 
-    /// All channels of `NV` vectors, the first of which is vector number `next` of the batch.
+    /// All channels of `NV` vectors over a block of taps.
     ///
     /// # Safety
-    /// Vectors `next..next + NV` exist, and `check` has passed.
+    /// Vectors `next..next + NV` of the place exist, its taps are some of the band's, and `check` has passed.
     #[inline(always)]
     unsafe fn column<S: Simd, const MR: usize, const NV: usize>(
         &self,
         simd: S,
-        next: usize,
+        place: Place,
         farthest: usize,
         x: &[f32],
         packed: &[f32],
         y: &mut [f32],
     ) {
+        let spans = &self.spans[place.band.spans.clone()];
         let mut starts = [x.as_ptr(); NV];
         let mut reaches = [0; NV];
         let mut outs = [0; NV];
         let mut lanes = [0; NV];
         let mut whole = true;
         for v in 0..NV {
-            let image = (next + v) / self.spans.len();
-            let span = self.spans[(next + v) % self.spans.len()];
+            let image = place.first_image + (place.next + v) / spans.len();
+            let span = spans[(place.next + v) % spans.len()];
             let start = image * self.in_image + self.origin + span.start;
             whole &= start + farthest + S::LANES <= x.len();
             starts[v] = x[start..].as_ptr();
@@ -150,48 +189,56 @@ impl TapSum {
             lanes[v] = span.lanes;
         }
         let full = (1u32 << S::LANES) - 1;
-        let blocks = self.taps.len().div_ceil(BLOCK_TAPS).max(1);
-        let block = self.taps.len().div_ceil(blocks).max(1);
-        for (number, taps) in self.taps.chunks(block).enumerate() {
-            let panels = packed.chunks_exact(MR * (self.taps.len() + 1));
-            for (first, panel) in (0..self.channels).step_by(MR).zip(panels) {
-                let rows = MR.min(self.channels - first);
-                let (panel, _) = panel.as_chunks::<MR>();
-                let mut sums = [[simd.splat(0.0); NV]; MR];
-                // SAFETY: every tap of every lane that holds an output lies in `x`, and its output in `y`, by `check`;
-                // loads go no further unless `whole` says that all lanes may be read.
-                unsafe {
-                    for r in 0..MR {
-                        for v in 0..NV {
-                            sums[r][v] = if number == 0 {
-                                simd.splat(panel[0][r])
-                            } else if r < rows {
-                                simd.load_spread(y.as_ptr().add(outs[v] + (first + r) * self.plane), lanes[v])
-                            } else {
-                                simd.splat(0.0)
-                            };
-                        }
+        let taps = &self.taps[place.taps.clone()];
+        let panels = packed.chunks_exact(MR * (self.taps.len() + 1));
+        for (first, panel) in (0..self.channels).step_by(MR).zip(panels) {
+            let rows = MR.min(self.channels - first);
+            let (panel, _) = panel.as_chunks::<MR>();
+            let mut sums = [[simd.splat(0.0); NV]; MR];
+            // SAFETY: every tap of every lane that holds an output lies in `x`, and its output in `y`, by `check`;
+            // loads go no further unless `whole` says that all lanes may be read.
+            unsafe {
+                for r in 0..MR {
+                    for v in 0..NV {
+                        sums[r][v] = if place.begins {
+                            simd.splat(panel[0][r])
+                        } else if r < rows {
+                            let from = y.as_ptr().add(outs[v] + (first + r) * self.plane);
+                            if lanes[v] == full { simd.load(from) } else { simd.load_spread(from, lanes[v]) }
+                        } else {
+                            simd.splat(0.0)
+                        };
                     }
-                    let weights = &panel[1 + number * block..][..taps.len()];
-                    if whole {
-                        tile::<S, MR, NV, false>(simd, taps, starts, reaches, weights, &mut sums);
-                    } else {
-                        tile::<S, MR, NV, true>(simd, taps, starts, reaches, weights, &mut sums);
-                    }
-                    for r in 0..rows {
-                        for v in 0..NV {
-                            let to = y.as_mut_ptr().add(outs[v] + (first + r) * self.plane);
-                            if lanes[v] == full {
-                                simd.store(to, sums[r][v]);
-                            } else {
-                                simd.store_gathered(to, sums[r][v], lanes[v]);
-                            }
+                }
+                let weights = &panel[1 + place.taps.start..][..taps.len()];
+                if whole {
+                    tile::<S, MR, NV, false>(simd, taps, starts, reaches, weights, &mut sums);
+                } else {
+                    tile::<S, MR, NV, true>(simd, taps, starts, reaches, weights, &mut sums);
+                }
+                for r in 0..rows {
+                    for v in 0..NV {
+                        let to = y.as_mut_ptr().add(outs[v] + (first + r) * self.plane);
+                        if lanes[v] == full {
+                            simd.store(to, sums[r][v]);
+                        } else {
+                            simd.store_gathered(to, sums[r][v], lanes[v]);
                         }
                     }
                 }
             }
         }
     }
+}
+
+/// Vectors from number `next` of a band on, counted through the images from `first_image` on, and a block of taps.
+struct Place<'a> {
+    band: &'a Band,
+    first_image: usize,
+    next: usize,
+    taps: Range<usize>,
+    /// Whether this is the first block, which begins with the bias.
+    begins: bool,
 }
 
 /// Adds the products of `MR` channels and `NV` vectors over the taps to `sums`.

@@ -8,7 +8,8 @@
 //! A map of few rows is mostly border, where this sum multiplies zeros. There each window's gradient is computed once,
 //! `dy' W`, as a matrix product, and the windows are added up where they overlap.
 
-use super::direct::TapSum;
+use super::direct::{Band, TapSum};
+use super::grid::Span;
 use super::prepare::put_every;
 use super::{ConvShape, FORWARD_COPIES, MOST_LANES, grid, group_of};
 use crate::Isa;
@@ -36,6 +37,49 @@ fn phases(len: usize, kernel: usize, stride: usize, pad: usize) -> Vec<Phase> {
         Phase { remainder, taps: (kernel - remainder).div_ceil(stride), first, count: end.saturating_sub(first) }
     };
     (0..stride.min(kernel)).map(phase).filter(|phase| phase.count > 0).collect()
+}
+
+/// Vectors times taps.
+fn work(bands: &[Band]) -> usize {
+    bands.iter().map(|band| band.spans.len() * band.taps.len()).sum()
+}
+
+/// The positions of a phase, and the bands they fall into, `row_taps` taps for each row of the kernel.
+///
+/// Row `q` of the phase meets the output rows `q - j`; where those do not exist, the taps would multiply zeros. Rows that
+/// meet all are one band, those at the border one each, unless short rows then leave more lanes idle than that saves.
+fn bands_of(
+    rows: Phase,
+    columns: usize,
+    out_h: usize,
+    row_taps: usize,
+    pitch: usize,
+    lanes: usize,
+) -> (Vec<Span>, Vec<Band>) {
+    let met = |q: usize| {
+        let first = (q + 1).saturating_sub(out_h).min(rows.taps);
+        first * row_taps..rows.taps.min(q + 1).max(first) * row_taps
+    };
+    let cut = |same: &dyn Fn(usize, usize) -> bool| {
+        let (mut spans, mut bands, mut from) = (Vec::new(), Vec::new(), 0);
+        while from < rows.count {
+            let end = (from..rows.count).find(|&row| !same(from, row)).unwrap_or(rows.count);
+            let first_span = spans.len();
+            spans.extend(grid::spans(end - from, columns, pitch, lanes).into_iter().map(|span| Span {
+                start: span.start + from * pitch,
+                out: span.out + from * columns,
+                lanes: span.lanes,
+            }));
+            let taps =
+                (from..end).map(|row| met(rows.first + row)).reduce(|a, b| a.start.min(b.start)..a.end.max(b.end));
+            bands.push(Band { spans: first_span..spans.len(), taps: taps.unwrap_or(0..0) });
+            from = end;
+        }
+        (spans, bands)
+    };
+    let by_rows = cut(&|a, b| met(rows.first + a) == met(rows.first + b));
+    let together = cut(&|_, _| true);
+    if work(&by_rows.1) < work(&together.1) { by_rows } else { together }
 }
 
 /// Where one remainder of rows and one of columns meet.
@@ -73,9 +117,10 @@ impl InputGradient {
         let mut parts = Vec::new();
         for &rows in &all_rows {
             for &columns in &all_columns {
+                // Row by row of the kernel, so that the rows of an image that miss some of them miss a run of taps.
                 let (mut taps, mut weights) = (Vec::new(), Vec::new());
-                for o in 0..oc {
-                    for j in 0..rows.taps {
+                for j in 0..rows.taps {
+                    for o in 0..oc {
                         for i in 0..columns.taps {
                             let (up, left) = (rows.taps - 1 - j, columns.taps - 1 - i);
                             taps.push((o * padded.0 + up) * padded.1 + left);
@@ -85,11 +130,14 @@ impl InputGradient {
                     }
                 }
                 let (top, left) = (before.0 + 1 - rows.taps, before.1 + 1 - columns.taps);
+                let (spans, bands) =
+                    bands_of(rows, columns.count, shape.out_h(), oc * columns.taps, padded.1, isa.lanes());
                 let sum = TapSum {
                     taps,
                     weights,
                     weight_stride: kh * kw,
-                    spans: grid::spans(rows.count, columns.count, padded.1, isa.lanes()),
+                    spans,
+                    bands,
                     origin: (rows.first + top) * padded.1 + columns.first + left,
                     in_image: oc * padded.0 * padded.1,
                     channels: c,
@@ -98,7 +146,7 @@ impl InputGradient {
                 parts.push(Part { rows, columns, sum });
             }
         }
-        let work: usize = parts.iter().map(|part| part.sum.spans.len() * isa.lanes() * part.sum.taps.len() * c).sum();
+        let work: usize = parts.iter().map(|part| work(&part.sum.bands) * isa.lanes() * c).sum();
         let by_product = work as f64 > MOST_WORK * shape.multiply_adds() as f64;
         InputGradient { shape, parts, before, padded, by_product }
     }

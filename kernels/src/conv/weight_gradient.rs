@@ -10,15 +10,20 @@ use crate::simd::{ALIGNMENT, Simd, align};
 
 /// Taps in a tile.
 const TILE_TAPS: usize = 3;
-/// Vectors of positions that are packed at a time: 32 x 8 channels x 64 bytes is half of a 32 KiB cache.
-const CHUNK: usize = 32;
+/// Vectors of positions that are packed at a time: 32 x 8 channels x 64 bytes, or 64 x 4 x 32, are at most half of a
+/// 32 KiB cache.
+const MOST_CHUNK: usize = 64;
+
+const fn chunk_vectors<S: Simd>() -> usize {
+    if S::MANY_REGISTERS { 32 } else { MOST_CHUNK }
+}
 /// The most lanes and channels a tile has on any instruction set.
 const MOST_LANES: usize = 16;
 const MOST_CHANNELS: usize = 8;
 
 /// Elements of scratch for `taps` taps.
 pub(crate) fn scratch_len(taps: usize) -> usize {
-    (CHUNK * MOST_CHANNELS + taps.next_multiple_of(TILE_TAPS) * MOST_CHANNELS) * MOST_LANES + ALIGNMENT
+    (32 * MOST_CHANNELS + taps.next_multiple_of(TILE_TAPS) * MOST_CHANNELS) * MOST_LANES + ALIGNMENT
 }
 
 /// Adds the gradient of the images in `dy` to `dweight` and `dbias`.
@@ -60,19 +65,20 @@ fn run_height<S: Simd, const MR: usize>(
     let images = dy.len() / image_len;
     sum.check::<S>(images, x.len(), dy.len());
     assert!(dweight.len() == sum.channels * taps && dbias.len() == sum.channels, "weight gradient: wrong length");
-    let (packed, sums) = align(scratch).split_at_mut(CHUNK * MR * S::LANES);
-    let sums = &mut sums[..taps.next_multiple_of(TILE_TAPS) * MR * S::LANES];
+    let (packed, sums) = align(scratch).split_at_mut(chunk_vectors::<S>() * MR * S::LANES);
+    // A row of vectors, one for each tap, for each channel.
+    let row = taps.next_multiple_of(TILE_TAPS);
+    let sums = &mut sums[..MR * row * S::LANES];
     let total = images * sum.spans.len();
     let farthest = sum.farthest();
 
     for first in (0..sum.channels).step_by(MR) {
         let rows = MR.min(sum.channels - first);
         packed.fill(0.0);
-        sums.fill(0.0);
         let mut bias = [simd.splat(0.0); MR];
-        for chunk in (0..total).step_by(CHUNK) {
-            let count = CHUNK.min(total - chunk);
-            let mut starts = [0; CHUNK];
+        for chunk in (0..total).step_by(chunk_vectors::<S>()) {
+            let count = chunk_vectors::<S>().min(total - chunk);
+            let mut starts = [0; MOST_CHUNK];
             let mut whole = 0;
             for i in 0..count {
                 let image = (chunk + i) / sum.spans.len();
@@ -82,7 +88,7 @@ fn run_height<S: Simd, const MR: usize>(
                 whole += usize::from(starts[i] + farthest + S::LANES <= x.len());
                 for r in 0..rows {
                     // SAFETY: the plane of an output channel holds the outputs of every span (`check`); `packed` holds
-                    // `CHUNK * MR` vectors.
+                    // `chunk_vectors() * MR` vectors.
                     unsafe {
                         let from = dy.as_ptr().add(image * image_len + (first + r) * sum.plane + span.out);
                         let full = span.lanes == (1 << S::LANES) - 1;
@@ -92,32 +98,40 @@ fn run_height<S: Simd, const MR: usize>(
                     }
                 }
             }
-            for (group, sums) in sums.chunks_exact_mut(TILE_TAPS * MR * S::LANES).enumerate() {
+            for group in (0..row).step_by(TILE_TAPS) {
                 let mut offsets = [0; TILE_TAPS];
                 for (t, offset) in offsets.iter_mut().enumerate() {
-                    *offset = sum.taps.get(group * TILE_TAPS + t).copied().unwrap_or(0);
+                    *offset = sum.taps.get(group + t).copied().unwrap_or(0);
                 }
+                let sums = &mut sums[group * S::LANES..];
                 // SAFETY: the first `whole` vectors may be read in full for every tap, the rest up to their reach;
-                // `packed` holds `count * MR` vectors and `sums` the vectors of a tile.
-                unsafe { tile::<S, MR>(simd, sum, x, packed, &starts[..count], chunk, whole, offsets, sums) };
+                // `packed` holds `count * MR` vectors and `sums` `MR` rows, but for what lies before the first tap.
+                unsafe { tile::<S, MR>(simd, sum, x, packed, &starts[..count], chunk, whole, offsets, row, sums) };
             }
         }
         for r in 0..rows {
             let o = first + r;
             dbias[o] += simd.sum(bias[r]);
-            for k in 0..taps {
-                let at = (k / TILE_TAPS * TILE_TAPS * MR + r * TILE_TAPS + k % TILE_TAPS) * S::LANES;
-                // SAFETY: `sums` holds `MR * TILE_TAPS` vectors for each group of taps.
-                dweight[o * taps + k] += simd.sum(unsafe { simd.load(sums[at..].as_ptr()) });
+            for (eight, dweight) in dweight[o * taps..][..taps].chunks_mut(8).enumerate() {
+                let mut of_taps = [simd.splat(0.0); 8];
+                let from = &sums[(r * row + eight * 8) * S::LANES..][..dweight.len() * S::LANES];
+                for (k, of_tap) in of_taps.iter_mut().enumerate().take(dweight.len()) {
+                    // SAFETY: `from` holds a vector for each tap.
+                    *of_tap = unsafe { simd.load(from.as_ptr().add(k * S::LANES)) };
+                }
+                for (dweight, sum) in dweight.iter_mut().zip(simd.sums(of_taps)) {
+                    *dweight += sum;
+                }
             }
         }
     }
 }
 
-/// Adds the products of `MR` channels and the taps at `offsets` over a chunk of positions to `sums`.
+/// Adds the products of `MR` channels and the taps at `offsets` over a chunk of positions to `sums`; the first chunk
+/// overwrites them.
 ///
 /// # Safety
-/// `packed` holds `starts.len() * MR` vectors and `sums` `MR * TILE_TAPS`. From each start plus each offset, `LANES`
+/// `packed` holds `starts.len() * MR` vectors, and `sums` `TILE_TAPS` from each of `MR` places `row` vectors apart. From each start plus each offset, `LANES`
 /// elements of `x` are readable for the first `whole` vectors, and as many as the span reaches for the others.
 #[inline(always)]
 unsafe fn tile<S: Simd, const MR: usize>(
@@ -129,6 +143,7 @@ unsafe fn tile<S: Simd, const MR: usize>(
     chunk: usize,
     whole: usize,
     offsets: [usize; TILE_TAPS],
+    row: usize,
     sums: &mut [f32],
 ) {
     let mut acc = [[simd.splat(0.0); TILE_TAPS]; MR];
@@ -138,9 +153,11 @@ unsafe fn tile<S: Simd, const MR: usize>(
     }
     // SAFETY: as the caller promises.
     unsafe {
-        for r in 0..MR {
-            for t in 0..TILE_TAPS {
-                acc[r][t] = simd.load(sums.as_ptr().add((r * TILE_TAPS + t) * S::LANES));
+        if chunk > 0 {
+            for r in 0..MR {
+                for t in 0..TILE_TAPS {
+                    acc[r][t] = simd.load(sums.as_ptr().add((r * row + t) * S::LANES));
+                }
             }
         }
         for (i, &start) in starts.iter().enumerate().take(whole) {
@@ -170,7 +187,7 @@ unsafe fn tile<S: Simd, const MR: usize>(
         }
         for r in 0..MR {
             for t in 0..TILE_TAPS {
-                simd.store(sums.as_mut_ptr().add((r * TILE_TAPS + t) * S::LANES), acc[r][t]);
+                simd.store(sums.as_mut_ptr().add((r * row + t) * S::LANES), acc[r][t]);
             }
         }
     }

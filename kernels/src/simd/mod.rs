@@ -20,6 +20,38 @@ pub(crate) fn align(scratch: &mut [f32]) -> &mut [f32] {
     &mut scratch[skip.min(ALIGNMENT)..]
 }
 
+/// The `LANES` elements from `at` on.
+#[inline(always)]
+pub(crate) fn get<S: Simd>(simd: S, from: &[f32], at: usize) -> S::V {
+    let from = &from[at..at + S::LANES];
+    // SAFETY: the slice has `LANES` elements.
+    unsafe { simd.load(from.as_ptr()) }
+}
+
+/// Writes the `LANES` elements from `at` on.
+#[inline(always)]
+pub(crate) fn put<S: Simd>(simd: S, to: &mut [f32], at: usize, v: S::V) {
+    let to = &mut to[at..at + S::LANES];
+    // SAFETY: the slice has `LANES` elements.
+    unsafe { simd.store(to.as_mut_ptr(), v) };
+}
+
+/// Twice `LANES` elements from `at` on, those at even places first.
+#[inline(always)]
+pub(crate) fn get_pairs<S: Simd>(simd: S, from: &[f32], at: usize) -> [S::V; 2] {
+    let from = &from[at..at + 2 * S::LANES];
+    // SAFETY: the slice has twice `LANES` elements.
+    unsafe { simd.load_pairs(from.as_ptr()) }
+}
+
+/// The reverse of [`get_pairs`].
+#[inline(always)]
+pub(crate) fn put_pairs<S: Simd>(simd: S, to: &mut [f32], at: usize, v: [S::V; 2]) {
+    let to = &mut to[at..at + 2 * S::LANES];
+    // SAFETY: the slice has twice `LANES` elements.
+    unsafe { simd.store_pairs(to.as_mut_ptr(), v) };
+}
+
 /// Vectors of `LANES` values of `f32`.
 pub(crate) trait Simd: Copy {
     /// A vector.
@@ -33,8 +65,21 @@ pub(crate) trait Simd: Copy {
     fn splat(self, value: f32) -> Self::V;
     /// `a * b + c`, fused where the instruction set can.
     fn mul_add(self, a: Self::V, b: Self::V, c: Self::V) -> Self::V;
+    /// Lane by lane, `yes` where `a > b`, else (also for NaN) `no`.
+    fn select_greater(self, a: Self::V, b: Self::V, yes: Self::V, no: Self::V) -> Self::V;
+    /// Lane by lane, `yes` where `a == b`, else (also for NaN) `no`.
+    fn select_equal(self, a: Self::V, b: Self::V, yes: Self::V, no: Self::V) -> Self::V;
     /// The sum of all lanes, in a fixed order.
     fn sum(self, v: Self::V) -> f32;
+    /// The sum of all lanes of each vector, in a fixed order.
+    #[inline(always)]
+    fn sums(self, v: [Self::V; 8]) -> [f32; 8] {
+        let mut sums = [0.0; 8];
+        for i in 0..8 {
+            sums[i] = self.sum(v[i]);
+        }
+        sums
+    }
 
     /// Reads `LANES` values.
     ///
@@ -46,6 +91,36 @@ pub(crate) trait Simd: Copy {
     /// # Safety
     /// `p` must be valid for reading `count` values.
     unsafe fn load_first(self, p: *const f32, count: usize) -> Self::V;
+    /// Reads `2 LANES` values: first those at even places, then those at odd ones.
+    ///
+    /// # Safety
+    /// `p` must be valid for reading `2 LANES` values.
+    #[inline(always)]
+    unsafe fn load_pairs(self, p: *const f32) -> [Self::V; 2] {
+        let mut lanes = [[0.0; 16]; 2];
+        for i in 0..2 * Self::LANES {
+            // SAFETY: the caller vouches for `2 LANES` values.
+            lanes[i % 2][i / 2 & 15] = unsafe { *p.add(i) };
+        }
+        // SAFETY: each row of `lanes` holds 16 values, and no vector is longer.
+        unsafe { [self.load(lanes[0].as_ptr()), self.load(lanes[1].as_ptr())] }
+    }
+    /// Writes `2 LANES` values, the reverse of [`Simd::load_pairs`].
+    ///
+    /// # Safety
+    /// `p` must be valid for writing `2 LANES` values.
+    #[inline(always)]
+    unsafe fn store_pairs(self, p: *mut f32, v: [Self::V; 2]) {
+        let mut lanes = [[0.0; 16]; 2];
+        // SAFETY: each row of `lanes` holds 16 values; the caller vouches for the places.
+        unsafe {
+            self.store(lanes[0].as_mut_ptr(), v[0]);
+            self.store(lanes[1].as_mut_ptr(), v[1]);
+            for i in 0..2 * Self::LANES {
+                *p.add(i) = lanes[i % 2][i / 2 & 15];
+            }
+        }
+    }
     /// Writes `LANES` values.
     ///
     /// # Safety

@@ -39,6 +39,31 @@ impl Simd for Neon {
     }
 
     #[inline(always)]
+    fn select_greater(self, a: float32x4_t, b: float32x4_t, yes: float32x4_t, no: float32x4_t) -> float32x4_t {
+        // SAFETY: the token proves NEON.
+        unsafe { vbslq_f32(vcgtq_f32(a, b), yes, no) }
+    }
+
+    #[inline(always)]
+    fn select_equal(self, a: float32x4_t, b: float32x4_t, yes: float32x4_t, no: float32x4_t) -> float32x4_t {
+        // SAFETY: the token proves NEON.
+        unsafe { vbslq_f32(vceqq_f32(a, b), yes, no) }
+    }
+
+    #[inline(always)]
+    unsafe fn load_pairs(self, p: *const f32) -> [float32x4_t; 2] {
+        // SAFETY: the token proves NEON, the caller vouches for 8 values.
+        let pairs = unsafe { vld2q_f32(p) };
+        [pairs.0, pairs.1]
+    }
+
+    #[inline(always)]
+    unsafe fn store_pairs(self, p: *mut f32, v: [float32x4_t; 2]) {
+        // SAFETY: the token proves NEON, the caller vouches for 8 places.
+        unsafe { vst2q_f32(p, float32x4x2_t(v[0], v[1])) }
+    }
+
+    #[inline(always)]
     fn sum(self, v: float32x4_t) -> f32 {
         // SAFETY: the token proves NEON.
         unsafe { vaddvq_f32(v) }

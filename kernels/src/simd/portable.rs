@@ -23,6 +23,16 @@ impl Simd for Portable {
     }
 
     #[inline(always)]
+    fn select_greater(self, a: [f32; 4], b: [f32; 4], yes: [f32; 4], no: [f32; 4]) -> [f32; 4] {
+        std::array::from_fn(|i| if a[i] > b[i] { yes[i] } else { no[i] })
+    }
+
+    #[inline(always)]
+    fn select_equal(self, a: [f32; 4], b: [f32; 4], yes: [f32; 4], no: [f32; 4]) -> [f32; 4] {
+        std::array::from_fn(|i| if a[i] == b[i] { yes[i] } else { no[i] })
+    }
+
+    #[inline(always)]
     fn sum(self, v: [f32; 4]) -> f32 {
         (v[0] + v[1]) + (v[2] + v[3])
     }

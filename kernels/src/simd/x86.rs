@@ -44,6 +44,42 @@ impl Simd for Avx2 {
     }
 
     #[inline(always)]
+    fn select_greater(self, a: __m256, b: __m256, yes: __m256, no: __m256) -> __m256 {
+        // SAFETY: the token proves AVX2.
+        unsafe { _mm256_blendv_ps(no, yes, _mm256_cmp_ps::<_CMP_GT_OQ>(a, b)) }
+    }
+
+    #[inline(always)]
+    fn select_equal(self, a: __m256, b: __m256, yes: __m256, no: __m256) -> __m256 {
+        // SAFETY: the token proves AVX2.
+        unsafe { _mm256_blendv_ps(no, yes, _mm256_cmp_ps::<_CMP_EQ_OQ>(a, b)) }
+    }
+
+    #[inline(always)]
+    unsafe fn load_pairs(self, p: *const f32) -> [__m256; 2] {
+        // SAFETY: the token proves AVX2, the caller vouches for 16 values.
+        unsafe {
+            let (low, high) = (_mm256_loadu_ps(p), _mm256_loadu_ps(p.add(8)));
+            let even = _mm256_castps_pd(_mm256_shuffle_ps::<0b10_00_10_00>(low, high));
+            let odd = _mm256_castps_pd(_mm256_shuffle_ps::<0b11_01_11_01>(low, high));
+            [
+                _mm256_castpd_ps(_mm256_permute4x64_pd::<0b11_01_10_00>(even)),
+                _mm256_castpd_ps(_mm256_permute4x64_pd::<0b11_01_10_00>(odd)),
+            ]
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn store_pairs(self, p: *mut f32, v: [__m256; 2]) {
+        // SAFETY: the token proves AVX2, the caller vouches for 16 places.
+        unsafe {
+            let (low, high) = (_mm256_unpacklo_ps(v[0], v[1]), _mm256_unpackhi_ps(v[0], v[1]));
+            _mm256_storeu_ps(p, _mm256_permute2f128_ps::<0x20>(low, high));
+            _mm256_storeu_ps(p.add(8), _mm256_permute2f128_ps::<0x31>(low, high));
+        }
+    }
+
+    #[inline(always)]
     fn sum(self, v: __m256) -> f32 {
         // SAFETY: the token proves AVX2.
         unsafe {
@@ -51,6 +87,21 @@ impl Simd for Avx2 {
             let two = _mm_add_ps(four, _mm_movehl_ps(four, four));
             _mm_cvtss_f32(_mm_add_ss(two, _mm_movehdup_ps(two)))
         }
+    }
+
+    #[inline(always)]
+    fn sums(self, v: [__m256; 8]) -> [f32; 8] {
+        let mut sums = [0.0; 8];
+        // SAFETY: the token proves AVX2; `sums` has 8 places.
+        unsafe {
+            // Each half of `low` then holds the sums of half of vectors 0 to 3, each half of `high` those of 4 to 7.
+            let low = _mm256_hadd_ps(_mm256_hadd_ps(v[0], v[1]), _mm256_hadd_ps(v[2], v[3]));
+            let high = _mm256_hadd_ps(_mm256_hadd_ps(v[4], v[5]), _mm256_hadd_ps(v[6], v[7]));
+            let first = _mm256_permute2f128_ps::<0x20>(low, high);
+            let second = _mm256_permute2f128_ps::<0x31>(low, high);
+            _mm256_storeu_ps(sums.as_mut_ptr(), _mm256_add_ps(first, second));
+        }
+        sums
     }
 
     #[inline(always)]
@@ -62,7 +113,7 @@ impl Simd for Avx2 {
     #[inline(always)]
     unsafe fn load_first(self, p: *const f32, count: usize) -> __m256 {
         // SAFETY: the token proves AVX2; the mask admits only the values for which the caller vouches.
-        unsafe { _mm256_maskload_ps(p, self.first(count)) }
+        unsafe { if count >= 8 { _mm256_loadu_ps(p) } else { _mm256_maskload_ps(p, self.first(count)) } }
     }
 
     #[inline(always)]
@@ -71,10 +122,49 @@ impl Simd for Avx2 {
         unsafe { _mm256_storeu_ps(p, v) }
     }
 
+    // `vmaskmovps` to memory is many times slower than a plain store on some processors (Zen), and where lanes are few,
+    // than one store a lane.
     #[inline(always)]
     unsafe fn store_first(self, p: *mut f32, v: __m256, count: usize) {
-        // SAFETY: the token proves AVX2; the mask admits only the values for which the caller vouches.
-        unsafe { _mm256_maskstore_ps(p, self.first(count), v) }
+        // SAFETY: the token proves AVX2; only the values for which the caller vouches are written.
+        unsafe {
+            if count >= 8 {
+                return _mm256_storeu_ps(p, v);
+            }
+            let (mut half, mut to) = (_mm256_castps256_ps128(v), p);
+            if count & 4 != 0 {
+                _mm_storeu_ps(to, half);
+                (half, to) = (_mm256_extractf128_ps::<1>(v), to.add(4));
+            }
+            if count & 2 != 0 {
+                _mm_storel_pd(to.cast(), _mm_castps_pd(half));
+                (half, to) = (_mm_movehl_ps(half, half), to.add(2));
+            }
+            if count & 1 != 0 {
+                _mm_store_ss(to, half);
+            }
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn load_spread(self, p: *const f32, mask: u32) -> __m256 {
+        // SAFETY: the token proves AVX2; as many values are read as the mask has bits.
+        unsafe {
+            let values = self.load_first(p, mask.count_ones() as usize);
+            let spread = _mm256_permutevar8x32_ps(values, lanes_of(&SPREAD, mask));
+            let bits = _mm256_setr_epi32(1, 2, 4, 8, 16, 32, 64, 128);
+            let held = _mm256_cmpeq_epi32(_mm256_and_si256(_mm256_set1_epi32(mask as i32), bits), bits);
+            _mm256_and_ps(spread, _mm256_castsi256_ps(held))
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn store_gathered(self, p: *mut f32, v: __m256, mask: u32) {
+        // SAFETY: the token proves AVX2; as many values are written as the mask has bits.
+        unsafe {
+            let gathered = _mm256_permutevar8x32_ps(v, lanes_of(&GATHER, mask));
+            self.store_first(p, gathered, mask.count_ones() as usize);
+        }
     }
 
     #[inline(always)]
@@ -89,6 +179,61 @@ impl Simd for Avx2 {
             _mm256_castpd_ps(_mm256_permute4x64_pd::<0b11_01_10_00>(even))
         }
     }
+
+    #[inline(always)]
+    unsafe fn store_every_second(self, p: *mut f32, v: __m256, count: usize) {
+        if count < 8 {
+            let mut lanes = [0.0; 8];
+            // SAFETY: the token proves AVX2; the last of `count` places is `2 count - 2`, for which the caller vouches.
+            unsafe {
+                _mm256_storeu_ps(lanes.as_mut_ptr(), v);
+                for (i, lane) in lanes.into_iter().enumerate().take(count) {
+                    *p.add(2 * i) = lane;
+                }
+            }
+            return;
+        }
+        // SAFETY: the token proves AVX2; places 0 to 14, for which the caller vouches, are read and written back. The
+        // second half begins at place 7, so that it ends at 14.
+        unsafe {
+            // Both are read first: a load that overlaps a store under way waits for it.
+            let (from_0, from_7) = (_mm256_loadu_ps(p), _mm256_loadu_ps(p.add(7)));
+            let low = _mm256_permutevar8x32_ps(v, _mm256_setr_epi32(0, 0, 1, 1, 2, 2, 3, 3));
+            let high = _mm256_permutevar8x32_ps(v, _mm256_setr_epi32(4, 4, 4, 5, 5, 6, 6, 7));
+            _mm256_storeu_ps(p, _mm256_blend_ps::<0b0101_0101>(from_0, low));
+            _mm256_storeu_ps(p.add(7), _mm256_blend_ps::<0b1010_1010>(from_7, high));
+        }
+    }
+}
+
+/// For each mask of 8 lanes, which of consecutive values a held lane takes (`SPREAD`).
+static SPREAD: [[u8; 8]; 256] = lane_table(false);
+/// For each mask of 8 lanes, which lanes are held, in order (`GATHER`).
+static GATHER: [[u8; 8]; 256] = lane_table(true);
+
+const fn lane_table(gather: bool) -> [[u8; 8]; 256] {
+    let mut table = [[0; 8]; 256];
+    let mut mask = 0;
+    while mask < 256 {
+        let (mut lane, mut next) = (0, 0);
+        while lane < 8 {
+            if mask >> lane & 1 == 1 {
+                let (at, value) = if gather { (next, lane) } else { (lane, next) };
+                table[mask][at] = value as u8;
+                next += 1;
+            }
+            lane += 1;
+        }
+        mask += 1;
+    }
+    table
+}
+
+/// The row of a lane table as 32-bit numbers.
+#[inline]
+#[target_feature(enable = "avx2,fma")]
+fn lanes_of(table: &[[u8; 8]; 256], mask: u32) -> __m256i {
+    _mm256_cvtepu8_epi32(_mm_cvtsi64_si128(i64::from_le_bytes(table[(mask & 255) as usize])))
 }
 
 /// The token of AVX-512 F, BW, DQ and VL.
@@ -124,6 +269,40 @@ impl Simd for Avx512 {
     fn mul_add(self, a: __m512, b: __m512, c: __m512) -> __m512 {
         // SAFETY: the token proves AVX-512.
         unsafe { _mm512_fmadd_ps(a, b, c) }
+    }
+
+    #[inline(always)]
+    fn select_greater(self, a: __m512, b: __m512, yes: __m512, no: __m512) -> __m512 {
+        // SAFETY: the token proves AVX-512.
+        unsafe { _mm512_mask_blend_ps(_mm512_cmp_ps_mask::<_CMP_GT_OQ>(a, b), no, yes) }
+    }
+
+    #[inline(always)]
+    fn select_equal(self, a: __m512, b: __m512, yes: __m512, no: __m512) -> __m512 {
+        // SAFETY: the token proves AVX-512.
+        unsafe { _mm512_mask_blend_ps(_mm512_cmp_ps_mask::<_CMP_EQ_OQ>(a, b), no, yes) }
+    }
+
+    #[inline(always)]
+    unsafe fn load_pairs(self, p: *const f32) -> [__m512; 2] {
+        // SAFETY: the token proves AVX-512, the caller vouches for 32 values.
+        unsafe {
+            let (low, high) = (_mm512_loadu_ps(p), _mm512_loadu_ps(p.add(16)));
+            let even = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
+            let odd = _mm512_setr_epi32(1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31);
+            [_mm512_permutex2var_ps(low, even, high), _mm512_permutex2var_ps(low, odd, high)]
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn store_pairs(self, p: *mut f32, v: [__m512; 2]) {
+        // SAFETY: the token proves AVX-512, the caller vouches for 32 places.
+        unsafe {
+            let low = _mm512_setr_epi32(0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23);
+            let high = _mm512_setr_epi32(8, 24, 9, 25, 10, 26, 11, 27, 12, 28, 13, 29, 14, 30, 15, 31);
+            _mm512_storeu_ps(p, _mm512_permutex2var_ps(v[0], low, v[1]));
+            _mm512_storeu_ps(p.add(16), _mm512_permutex2var_ps(v[0], high, v[1]));
+        }
     }
 
     #[inline(always)]

@@ -32,6 +32,35 @@ fn activations_agree_with_the_loops() {
             reference::elu_backward(0.7, &y, &dy, &mut expected);
             activation::elu_backward(isa, 0.7, &y, &dy, &mut actual);
             failures.compare(&format!("elu_backward {} {len}", isa.name()), &actual, &expected, 1e-6);
+
+            let (mut expected, mut actual) = (nans(len), nans(len));
+            reference::leaky_relu_forward(-0.3, &x, &mut expected);
+            activation::leaky_relu_forward(isa, -0.3, &x, &mut actual);
+            failures.compare(&format!("leaky_relu_forward {} {len}", isa.name()), &actual, &expected, 0.0);
+            let (mut expected, mut actual) = (nans(len), nans(len));
+            reference::leaky_relu_backward(-0.3, &x, &dy, &mut expected);
+            activation::leaky_relu_backward(isa, -0.3, &x, &dy, &mut actual);
+            failures.compare(&format!("leaky_relu_backward {} {len}", isa.name()), &actual, &expected, 0.0);
+
+            let (mut expected, mut actual) = (nans(len), nans(len));
+            reference::tanh_forward(&x, &mut expected);
+            activation::tanh_forward(isa, &x, &mut actual);
+            failures.compare(&format!("tanh_forward {} {len}", isa.name()), &actual, &expected, 2e-6);
+            let y = expected.clone();
+            let (mut expected, mut actual) = (nans(len), nans(len));
+            reference::tanh_backward(&y, &dy, &mut expected);
+            activation::tanh_backward(isa, &y, &dy, &mut actual);
+            failures.compare(&format!("tanh_backward {} {len}", isa.name()), &actual, &expected, 1e-6);
+
+            let (mut expected, mut actual) = (nans(len), nans(len));
+            reference::softsign_forward(&x, &mut expected);
+            activation::softsign_forward(isa, &x, &mut actual);
+            failures.compare(&format!("softsign_forward {} {len}", isa.name()), &actual, &expected, 1e-6);
+            let y = expected.clone();
+            let (mut expected, mut actual) = (nans(len), nans(len));
+            reference::softsign_backward(&y, &dy, &mut expected);
+            activation::softsign_backward(isa, &y, &dy, &mut actual);
+            failures.compare(&format!("softsign_backward {} {len}", isa.name()), &actual, &expected, 1e-6);
         }
     }
     failures.report();

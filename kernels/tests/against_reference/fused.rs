@@ -1,0 +1,133 @@
+//! Kernels that do what several others do, against those loops one after the other.
+
+use super::{Failures, isas, nans, numbers};
+use steersman_kernels::conv::{Conv, ConvShape};
+use steersman_kernels::norm_rectify::{self, ChannelMeans, ChannelStatistics, RectifyShape, Slopes};
+use steersman_kernels::{pool, reference};
+
+/// Maps around the vector widths, even and odd, down to those without a window.
+const MAPS: &[[usize; 3]] = &[
+    [1, 1, 1],
+    [2, 2, 2],
+    [3, 3, 5],
+    [2, 4, 15],
+    [1, 5, 16],
+    [2, 2, 17],
+    [1, 6, 31],
+    [2, 4, 32],
+    [1, 3, 33],
+    [2, 5, 47],
+    [1, 2, 66],
+    [3, 1, 700],
+    [2, 37, 157],
+];
+
+#[test]
+fn norm_rectify_agrees_with_its_parts() {
+    let mut failures = Failures::default();
+    for isa in isas() {
+        for &[c, h, w] in MAPS {
+            for pooled in [false, true] {
+                for kind in ["relu", "a slope a channel", "a slope an element"] {
+                    let n = 3;
+                    let (hw, image) = (h * w, c * h * w);
+                    let what = format!("{} {c}x{h}x{w} pooled {pooled} {kind}", isa.name());
+                    let shape = RectifyShape { c, h, w, pooled };
+                    let pool_shape = pool::PoolShape { c, h, w, kh: 2, kw: 2, stride_h: 2, stride_w: 2 };
+                    let y_len = if pooled { n * c * pool_shape.out_h() * pool_shape.out_w() } else { n * image };
+                    let (x, dy) = (numbers(1, n * image), numbers(2, y_len));
+                    let (scale, shift, mean) = (numbers(3, c), numbers(4, c), numbers(5, c));
+                    let inv_std: Vec<f32> = numbers(6, c).iter().map(|v| v + 1.5).collect();
+                    let (a, b, g) = (numbers(7, c), numbers(8, c), numbers(9, c));
+                    let list = numbers(10, if kind == "a slope an element" { image } else { c });
+                    let (slopes, repeat) = match kind {
+                        "relu" => (Slopes::Zero, 0),
+                        "a slope a channel" => (Slopes::PerChannel(&list), hw),
+                        _ => (Slopes::PerPosition(&list), 1),
+                    };
+
+                    let (mut z, mut f, mut y) = (nans(n * image), nans(n * image), nans(y_len));
+                    reference::normalize(c, hw, &x, &scale, &shift, &mut z);
+                    match slopes {
+                        Slopes::Zero => reference::relu_forward(&z, &mut f),
+                        _ => reference::prelu_forward(&list, repeat, &z, &mut f),
+                    }
+                    match pooled {
+                        true => reference::max_forward(&pool_shape, n, &f, &mut y),
+                        false => y.copy_from_slice(&f),
+                    }
+                    let mut actual = nans(y_len);
+                    norm_rectify::forward(isa, &shape, n, &x, &scale, &shift, slopes, &mut actual);
+                    failures.compare(&format!("forward {what}"), &actual, &y, 1e-6);
+
+                    let (mut df, mut dz, mut dx) = (nans(n * image), nans(n * image), nans(n * image));
+                    match pooled {
+                        true => reference::max_backward(&pool_shape, n, &f, &y, &dy, &mut df),
+                        false => df.copy_from_slice(&dy),
+                    }
+                    let slope_count = if kind == "relu" { 0 } else { list.len() };
+                    let (mut dslopes, mut actual_dslopes) = (numbers(11, slope_count), numbers(11, slope_count));
+                    match slopes {
+                        Slopes::Zero => reference::relu_backward(&f, &df, &mut dz),
+                        _ => reference::prelu_backward(&list, repeat, &z, &df, &mut dz, &mut dslopes),
+                    }
+                    let (mut sums, mut actual_sums) = (vec![0.5; 2 * c], vec![0.5; 2 * c]);
+                    reference::norm_backward_sums((c, hw), &x, &dz, &mean, &inv_std, &mut sums);
+                    reference::norm_backward((c, hw), &x, &dz, [&mean, &inv_std, &a, &b, &g], &mut dx);
+
+                    let statistics = ChannelStatistics { mean: &mean, inv_std: &inv_std, scale: &scale, shift: &shift };
+                    let ds = &mut actual_dslopes;
+                    norm_rectify::backward_sums(isa, &shape, n, &x, &dy, statistics, slopes, &mut actual_sums, ds);
+                    let narrow = |sums: &[f64]| sums.iter().map(|&sum| sum as f32).collect::<Vec<f32>>();
+                    failures.compare(&format!("sums {what}"), &narrow(&actual_sums), &narrow(&sums), 1e-5);
+                    failures.compare(&format!("slopes {what}"), &actual_dslopes, &dslopes, 1e-5);
+                    let mut actual = x.clone();
+                    let means = ChannelMeans { dz: &a, dz_xhat: &b, gain: &g };
+                    norm_rectify::backward(isa, &shape, n, &mut actual, &dy, statistics, means, slopes);
+                    failures.compare(&format!("backward {what}"), &actual, &dx, 1e-5);
+                }
+            }
+        }
+    }
+    failures.report();
+}
+
+#[test]
+fn gradients_behind_a_pooling_agree_with_those_of_the_whole_map() {
+    let mut failures = Failures::default();
+    for isa in isas() {
+        for ([c, h, w, oc], k) in [([1, 14, 18, 3], 3), ([3, 11, 7, 2], 3), ([2, 9, 13, 5], 5), ([1, 6, 6, 1], 3)] {
+            let n = 2;
+            let [pad_top, pad_bottom, pad_left, pad_right] = [0; 4];
+            let (stride_h, stride_w) = (1, 1);
+            let shape =
+                ConvShape { c, h, w, oc, kh: k, kw: k, stride_h, stride_w, pad_top, pad_bottom, pad_left, pad_right };
+            let what = format!("{} {shape:?}", isa.name());
+            let (out_h, out_w) = (shape.out_h(), shape.out_w());
+            let pool_shape = pool::PoolShape { c: oc, h: out_h, w: out_w, kh: 4, kw: 4, stride_h: 4, stride_w: 4 };
+            let pooled = n * oc * pool_shape.out_h() * pool_shape.out_w();
+            let (map, dpooled) = (numbers(1, n * oc * out_h * out_w), numbers(2, pooled));
+            let (mut y, mut expected, mut places) = (nans(pooled), nans(pooled), vec![u32::MAX; pooled]);
+            pool::max_forward_with_places(isa, &pool_shape, n, w, &map, &mut y, &mut places);
+            reference::max_forward(&pool_shape, n, &map, &mut expected);
+            failures.compare(&format!("maximum {what}"), &y, &expected, 0.0);
+            let mut dmap = nans(map.len());
+            reference::max_backward(&pool_shape, n, &map, &y, &dpooled, &mut dmap);
+
+            let (x, weight) = (numbers(3, n * c * h * w), numbers(4, oc * c * k * k));
+            let (mut dweight, mut dbias) = (numbers(5, weight.len()), numbers(6, oc));
+            let (mut actual_dweight, mut actual_dbias) = (dweight.clone(), dbias.clone());
+            let (mut dx, mut actual_dx) = (nans(x.len()), nans(x.len()));
+            reference::conv_backward_weight(&shape, n, &x, &dmap, &mut dweight, &mut dbias);
+            reference::conv_backward_input(&shape, n, &dmap, &weight, &mut dx);
+            let conv = Conv::new(shape, isa);
+            assert!(conv.has_sparse_gradients());
+            conv.sparse_backward_weight(n, &x, &places, &dpooled, &mut actual_dweight, &mut actual_dbias);
+            conv.sparse_backward_input(n, &places, &dpooled, &weight, &mut actual_dx);
+            failures.compare(&format!("weight {what}"), &actual_dweight, &dweight, 1e-5);
+            failures.compare(&format!("bias {what}"), &actual_dbias, &dbias, 1e-5);
+            failures.compare(&format!("input {what}"), &actual_dx, &dx, 1e-5);
+        }
+    }
+    failures.report();
+}

@@ -1,0 +1,151 @@
+//! `steersman experiment`: the two experiments of the write-ups, each to the end of the road.
+
+use std::path::PathBuf;
+
+use clap::{Args, ValueEnum};
+
+use super::progress::Progress;
+use super::share_bar::Bars;
+use super::{RecipeArgs, or_dash, pool, print_json, stop_on_ctrl_c};
+use crate::error::{Error, Result};
+use crate::main_job::experiment::{self, Plan, Subject, Trial, takes, write_csv};
+use crate::main_job::job::training_set;
+use crate::simulator::Track;
+
+/// Compare splits or colour spaces: what the validation loss promises beside what the drive delivers
+#[derive(Debug, Args)]
+pub struct ExperimentArgs {
+    /// What is varied
+    subject: SubjectArg,
+    #[command(flatten)]
+    recipe: RecipeArgs,
+    /// Trainings of each variant, with the seeds 1, 2, …
+    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=100))]
+    seeds: u64,
+    /// Track to drive; may be given several times [default: lake, forest, random:1000001]
+    #[arg(long = "track", value_name = "TRACK")]
+    tracks: Vec<String>,
+    /// Runs on each track, of one lap
+    #[arg(long, default_value_t = 2)]
+    runs: usize,
+    /// Random tracks to train on, beside lake and mountain
+    #[arg(long, default_value_t = 12, value_name = "N")]
+    random_tracks: usize,
+    /// Train on these recordings instead of the simulator's
+    #[arg(long = "recording", value_name = "RECORDING")]
+    recordings: Vec<PathBuf>,
+    /// A first impression: one seed, 2 epochs, one run on one track
+    #[arg(long, conflicts_with_all = ["seeds", "runs"])]
+    quick: bool,
+    /// Save every trial as a line of this CSV file; must not exist
+    #[arg(long, value_name = "FILE")]
+    out: Option<PathBuf>,
+    /// Memory for decoded images, in MiB
+    #[arg(long, default_value_t = 1024, value_name = "MIB")]
+    cache: usize,
+    /// Threads; 0 is one for each core
+    #[arg(long, default_value_t = 0)]
+    threads: usize,
+    /// Print one JSON array as the last line
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum SubjectArg {
+    /// Validation rows by blocks of time, single rows, single images
+    Split,
+    /// RGB, YUV, HSV, the saturation alone, grey
+    Colour,
+}
+
+pub fn run(args: ExperimentArgs) -> Result<()> {
+    if args.runs == 0 {
+        return Err(Error::Usage("--runs 0: at least 1 run is needed".into()));
+    }
+    if let Some(out) = args.out.as_deref().filter(|out| out.exists()) {
+        let message = format!("{}: exists already and is not overwritten; name a new file", out.display());
+        return Err(Error::Usage(message));
+    }
+    let mut recipe = args.recipe.find()?;
+    let (seeds, runs) = if args.quick { (1, 1) } else { (args.seeds, args.runs) };
+    let mut tracks = args.tracks;
+    if tracks.is_empty() {
+        tracks = ["lake", "forest", "random:1000001"].map(String::from).to_vec();
+    }
+    if args.quick {
+        recipe.epochs = recipe.epochs.min(2);
+        tracks.truncate(1);
+    }
+    for track in &tracks {
+        Track::load(track)?;
+    }
+    let stop = stop_on_ctrl_c()?;
+    let (pool, bars, mut progress) = (pool(args.threads)?, Bars, Progress::new());
+    let recordings = match args.recordings.is_empty() {
+        true => pool.install(|| training_set(&takes(args.random_tracks), &bars, &stop))?,
+        false => args.recordings,
+    };
+    let subject = match args.subject {
+        SubjectArg::Split => Subject::Split,
+        SubjectArg::Colour => Subject::Colour,
+    };
+    let plan = Plan { subject, recipe, seeds, recordings, tracks, runs, cache_mib: args.cache };
+    // A stop keeps what is done so far.
+    let mut done = Vec::new();
+    let mut told = |trial: &Trial| {
+        done.push(trial.clone());
+        args.out.as_deref().map_or(Ok(()), |out| write_csv(out, &done))
+    };
+    let trials = pool.install(|| experiment::run(&plan, &mut progress, &bars, &stop, &mut told))?;
+    if args.json {
+        return print_json(&trials);
+    }
+    print_table(&plan, &trials);
+    if let Some(out) = &args.out {
+        println!("every trial: {}", out.display());
+    }
+    Ok(())
+}
+
+fn print_table(plan: &Plan, trials: &[Trial]) {
+    println!(
+        "recipe {}, {} epochs, {} recordings; {} trainings of each; driven: {}, {} runs of a lap on each",
+        plan.recipe.name,
+        plan.recipe.epochs,
+        plan.recordings.len(),
+        plan.seeds,
+        plan.tracks.join(", "),
+        plan.runs
+    );
+    println!("                     promised by validation |  delivered on the road");
+    println!("variant        leak       MSE       MAE     |  fresh MAE   laps     autonomy       distance from line");
+    let mut variants: Vec<&str> = trials.iter().map(|trial| trial.variant.as_str()).collect();
+    variants.dedup();
+    for variant in variants {
+        let of: Vec<&Trial> = trials.iter().filter(|trial| trial.variant == variant).collect();
+        let mean = |f: &dyn Fn(&Trial) -> f64| of.iter().map(|trial| f(trial)).sum::<f64>() / of.len() as f64;
+        let present = |f: &dyn Fn(&Trial) -> Option<f64>| {
+            of.iter().map(|trial| f(trial)).sum::<Option<f64>>().map(|sum| sum / of.len() as f64)
+        };
+        let low = of.iter().map(|trial| trial.autonomy_percent).fold(f64::INFINITY, f64::min);
+        let high = of.iter().map(|trial| trial.autonomy_percent).fold(0.0, f64::max);
+        let laps: usize = of.iter().map(|trial| trial.laps_completed).sum();
+        let laps_total: usize = of.iter().map(|trial| trial.laps_total).sum();
+        println!(
+            "{variant:<13} {:>3.0} %  {:>8}  {:>6} deg  |  {:>5.2} deg {:>9}  {:>5.1} % ({low:.0} to {high:.0}) {:>8.2} m",
+            mean(&|t| t.leak_percent),
+            or_dash(present(&|t| t.val_center_mse), 5),
+            or_dash(present(&|t| t.val_mae_deg), 2),
+            mean(&|t| t.fresh_mae_deg),
+            format!("{laps}/{laps_total}"),
+            mean(&|t| t.autonomy_percent),
+            mean(&|t| t.cte_mean_m),
+        );
+    }
+    println!(
+        "means over the trainings; in brackets the least and most. leak: validation frames with a training frame of the same\n\
+         drive within 1 s. MSE, MAE: centre camera. fresh: frames of the driven tracks that no training has seen. laps: without\n\
+         help. autonomy: NVIDIA's, 6 s for each time the car is put back."
+    );
+}

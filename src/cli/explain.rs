@@ -1,0 +1,110 @@
+//! `steersman explain`: what a model looks at.
+
+use std::path::PathBuf;
+use std::sync::atomic::Ordering;
+
+use clap::Args;
+use serde::Serialize;
+
+use super::share_bar::ShareBar;
+use super::{new_folder, pool, print, print_json, refuse_existing, stop_on_ctrl_c};
+use crate::atomic_file;
+use crate::error::{Error, Result};
+use crate::pilot::Pilot;
+use crate::report::counterfactual::{Counterfactuals, examine};
+use crate::report::explanation::{self, Exhibit};
+use crate::report::footage::Footage;
+
+/// Show what a model looks at: saliency, filters, feature maps, and what happens when the picture is changed
+#[derive(Debug, Args)]
+pub struct ExplainArgs {
+    /// Model file
+    model: PathBuf,
+    /// Images, or recordings
+    #[arg(value_name = "IMAGE|RECORDING", required_unless_present = "track", conflicts_with = "track")]
+    inputs: Vec<PathBuf>,
+    /// Look at what the simulator's expert sees on a lap: lake, mountain, coast, forest, random:SEED, or a track file
+    #[arg(long)]
+    track: Option<String>,
+    /// Draws start and light of that lap
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Folder for explain.html and the PNG files; must not exist
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// Threads; 0 is one for each core
+    #[arg(long, default_value_t = 0)]
+    threads: usize,
+    /// Print one JSON object as the last line
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Serialize)]
+struct Answer<'a> {
+    #[serde(flatten)]
+    found: &'a Counterfactuals,
+    page: PathBuf,
+    pictures_written: Vec<PathBuf>,
+}
+
+pub fn run(args: ExplainArgs) -> Result<()> {
+    let pilot = Pilot::load(&args.model)?;
+    refuse_existing(&args.out)?;
+    let footage = match &args.track {
+        Some(track) => Footage::of_track(track, args.seed)?,
+        None => Footage::of_paths(&args.inputs)?,
+    };
+    let stop = stop_on_ctrl_c()?;
+    let bar = ShareBar::new("changing pictures");
+    let progress = |share| {
+        bar.set(share);
+        !stop.load(Ordering::Relaxed)
+    };
+    let (found, steering) = pool(args.threads)?.install(|| examine(&pilot, &footage, &progress))?;
+    drop(bar);
+    let exhibits = explanation::exhibits(&pilot, &footage, &steering)?;
+    let title = format!("{} on {}", args.model.display(), what(&args));
+    let page = explanation::page(&title, &pilot, &found, &exhibits);
+
+    new_folder(&args.out)?;
+    let mut written = Vec::new();
+    let pictures = exhibits.saliency.iter().chain(&exhibits.filters).chain(&exhibits.features).chain(&exhibits.changes);
+    for Exhibit { name, picture, .. } in pictures {
+        let path = args.out.join(format!("{name}.png"));
+        std::fs::write(&path, picture.to_png()).map_err(Error::io(&path))?;
+        written.push(path);
+    }
+    let path = args.out.join("explain.html");
+    atomic_file::write(&path, page.as_bytes())?;
+    if args.json {
+        return print_json(&Answer { found: &found, page: path, pictures_written: written });
+    }
+    print(&text(&found))?;
+    eprintln!("wrote {} and {} pictures", path.display(), written.len());
+    Ok(())
+}
+
+fn what(args: &ExplainArgs) -> String {
+    match (&args.track, &args.inputs[..]) {
+        (Some(track), _) => track.clone(),
+        (None, [only]) => only.display().to_string(),
+        (None, inputs) => format!("{} inputs", inputs.len()),
+    }
+}
+
+/// The table for the terminal, and the verdict.
+fn text(found: &Counterfactuals) -> String {
+    let (_, rows) = explanation::table(found);
+    let mut text = format!("{} pictures; angles of the front wheels\n\n", found.pictures);
+    text += "change                              moves by  95 % below  right way    error\n";
+    for row in rows {
+        let [change, moved, p95, _, right_way, error, passed, verdict] = &row[..] else { continue };
+        text += &format!("{change:<34} {moved:>9} {p95:>11} {right_way:>10} {error:>8}  {passed:<4} {verdict}\n");
+    }
+    text.push('\n');
+    for sentence in &found.verdict {
+        text += &format!("{sentence}\n");
+    }
+    text
+}

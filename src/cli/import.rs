@@ -1,0 +1,238 @@
+//! `steersman import`: a model that Keras saved becomes a model file.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use serde::Serialize;
+use steersman_kernels::Isa;
+
+use super::{or_dash, pool, print, print_json};
+use crate::dataset;
+use crate::dataset::colour::Colour;
+use crate::dataset::preprocess::Preprocessing;
+use crate::dataset::resize::Interpolation;
+use crate::error::{Error, Result};
+use crate::exchange::fit::{self, Candidate, Frames};
+use crate::exchange::keras::{self, ImportOptions, LayerReport};
+use crate::exchange::presets;
+use crate::model_file::weights_hash;
+use crate::network::Network;
+use crate::tensor::Shape;
+
+/// Import a Keras model: HDF5 of Keras 1 and 2, or the .keras file of Keras 3
+#[derive(Debug, Args)]
+pub struct ImportArgs {
+    /// HDF5 or .keras file
+    file: PathBuf,
+    /// The architecture, for files that hold weights only: the JSON of Keras' to_json
+    #[arg(long, value_name = "JSON")]
+    architecture: Option<PathBuf>,
+    /// How an image becomes the input: a preset (naokishibuya, naokishibuya-2017-01-14, diz-vara, oargueta, udacity,
+    /// udacity-bgr), that of a built-in recipe, or a TOML file
+    #[arg(long, value_name = "NAME|FILE")]
+    preprocessing: Option<String>,
+    /// Try the plausible preprocessings on a recording and rank them; without --preprocessing, --out takes the best
+    #[arg(long, value_name = "RECORDING")]
+    fit: Option<PathBuf>,
+    /// A Lambda layer computes x / A - B, where its byte code does not say so
+    #[arg(long = "lambda", value_name = "LAYER=A,B", value_parser = parse_lambda, allow_hyphen_values = true)]
+    lambdas: Vec<(String, (f64, f64))>,
+    /// The weights come from Theano before Keras 2: its convolutions turned their kernels by 180 degrees
+    #[arg(long)]
+    theano_kernels: bool,
+    /// Model file to write; must not exist
+    #[arg(long, value_name = "MODEL", required_unless_present = "fit")]
+    out: Option<PathBuf>,
+    /// Threads of --fit; 0 is one for each core
+    #[arg(long, default_value_t = 0)]
+    threads: usize,
+    /// Print one JSON object as the last line
+    #[arg(long)]
+    json: bool,
+}
+
+fn parse_lambda(text: &str) -> Result<(String, (f64, f64)), String> {
+    let (layer, numbers) = text.split_once('=').ok_or("expected LAYER=A,B, as in lambda_1=127.5,1")?;
+    let (a, b) = numbers.split_once(',').ok_or("expected two numbers: LAYER=A,B, as in lambda_1=127.5,1")?;
+    let number = |text: &str| text.trim().parse().map_err(|_| format!("`{}` is no number", text.trim()));
+    let (a, b): (f64, f64) = (number(a)?, number(b)?);
+    if a == 0.0 || !a.is_finite() || !b.is_finite() {
+        return Err("A must not be zero, and both must be finite".into());
+    }
+    Ok((layer.trim().into(), (a, b)))
+}
+
+#[derive(Serialize)]
+struct Answer {
+    keras_version: Option<String>,
+    input: Shape,
+    parameters: usize,
+    layers: Vec<LayerReport>,
+    preprocessing: Preprocessing,
+    weights: String,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    fit: Vec<Fit>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    model: Option<PathBuf>,
+}
+
+#[derive(Serialize)]
+struct Fit {
+    correlation: Option<f64>,
+    preprocessing: Preprocessing,
+}
+
+pub fn run(args: ImportArgs) -> Result<()> {
+    if let Some(out) = args.out.as_ref().filter(|out| out.exists()) {
+        return Err(Error::Usage(format!("{} exists; choose another --out", out.display())));
+    }
+    let given = args.preprocessing.as_deref().map(presets::find).transpose()?;
+    let shape_of = |p: &Preprocessing| {
+        let [c, h, w] = p.output();
+        Shape::new(c, h, w)
+    };
+    let options = ImportOptions {
+        architecture: args.architecture.clone(),
+        lambdas: args.lambdas.iter().cloned().collect::<BTreeMap<_, _>>(),
+        theano_kernels: args.theano_kernels,
+        input: given.as_ref().map(shape_of),
+    };
+    let imported = keras::import(&args.file, &options)?;
+    for notice in &imported.notices {
+        eprintln!("note: {notice}");
+    }
+    let network = Network::new(imported.input, &imported.layers, Isa::best())?;
+
+    let ranking = match &args.fit {
+        Some(recording) => {
+            let pool = pool(args.threads)?;
+            let recording = pool.install(|| dataset::load(recording))?;
+            let frames = pool.install(|| Frames::of(&recording))?;
+            let count = fit::combinations(&network).len();
+            eprintln!("trying {count} combinations on up to {} frames of {}", frames.len(), recording.path.display());
+            pool.install(|| fit::rank(&network, &imported.parameters, &frames, given.as_ref()))?
+        }
+        None => Vec::new(),
+    };
+    let preprocessing = match (given, ranking.first()) {
+        (Some(given), _) => given,
+        (None, Some(best)) => best.preprocessing.clone(),
+        (None, None) => {
+            let guess = whole_image(imported.input)?;
+            eprintln!(
+                "warning: the file does not say how an image becomes the network's input. The whole image in {} is a guess: \
+                 colour order, crop and scaling may be others. Name them with --preprocessing, or let --fit RECORDING find \
+                 what fits",
+                if imported.input.c == 3 { "RGB" } else { "grey" }
+            );
+            guess
+        }
+    };
+
+    let mut text = layer_table(&imported.report);
+    text += &ranking_table(&ranking);
+    if !ranking.is_empty() {
+        text += &format!("\n[preprocessing]\n{}\n", fit::to_toml(&args.file, &ranking[0].preprocessing)?);
+    }
+    let answer = Answer {
+        keras_version: imported.keras_version.clone(),
+        input: imported.input,
+        parameters: network.count(true) + network.count(false),
+        layers: imported.report.clone(),
+        preprocessing: preprocessing.clone(),
+        weights: weights_hash(&network, &imported.parameters),
+        fit: ranking
+            .into_iter()
+            .map(|Candidate { preprocessing, correlation }| Fit { correlation, preprocessing })
+            .collect(),
+        model: args.out.clone(),
+    };
+    let model = imported.into_model(&name_of(&args.file), preprocessing)?;
+    if let Some(out) = &args.out {
+        model.save(out)?;
+        text += &format!("model {}\n", out.display());
+    }
+    if args.json { print_json(&answer) } else { print(&text) }
+}
+
+/// The whole image, resized to the network's input.
+fn whole_image(input: Shape) -> Result<Preprocessing> {
+    let colour = match input.c {
+        3 => Colour::Rgb,
+        1 => Colour::Gray,
+        c => {
+            let message =
+                format!("the network takes {c} colour planes: say with --preprocessing how an image gives them");
+            return Err(Error::Usage(message));
+        }
+    };
+    Ok(Preprocessing { resize: [input.h, input.w], colour, ..Preprocessing::default() })
+}
+
+/// A recipe's name from a file's name.
+fn name_of(file: &Path) -> String {
+    let stem = file.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
+    let name: String = stem.chars().map(|c| if c.is_alphanumeric() || "-_.".contains(c) { c } else { '-' }).collect();
+    let name = name.trim_start_matches('.');
+    if name.is_empty() { "imported".into() } else { name.into() }
+}
+
+fn layer_table(report: &[LayerReport]) -> String {
+    let mut text = format!("{:<28} {:<24} {}\n", "layer", "class", "becomes");
+    for LayerReport { layer, class, becomes } in report {
+        let becomes = if becomes.is_empty() { "-".to_string() } else { becomes.join(", ") };
+        text += &format!("{layer:<28} {class:<24} {becomes}\n");
+    }
+    text
+}
+
+fn ranking_table(ranking: &[Candidate]) -> String {
+    if ranking.is_empty() {
+        return String::new();
+    }
+    let mut text = format!(
+        "\n{:>11}  {:<12} {:<12} {:<14} {:<8} {}\n",
+        "correlation", "colour", "rows", "resize", "method", "input"
+    );
+    for Candidate { preprocessing: p, correlation } in ranking {
+        let colour = p.colour.name();
+        let method = match p.interpolation {
+            Interpolation::Linear => "linear",
+            Interpolation::Area => "area",
+        };
+        let rows = format!("{} to {}", p.rows[0], p.rows[1]);
+        let size = format!("{}x{}{}", p.resize[0], p.resize[1], if p.colour_first { " after" } else { "" });
+        let scaling = match (p.scale, p.offset) {
+            (1.0, 0.0) => "grey levels".to_string(),
+            (scale, offset) => format!("x / {} {offset:+}", 1.0 / scale),
+        };
+        text += &format!(
+            "{:>11}  {:<12} {rows:<12} {size:<14} {:<8} {scaling}\n",
+            or_dash(*correlation, 3),
+            colour,
+            method,
+        );
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_lambda_is_named_with_two_numbers() {
+        assert_eq!(parse_lambda("lambda_1=127.5, 1").unwrap(), ("lambda_1".into(), (127.5, 1.0)));
+        for wrong in ["lambda_1", "a=1", "a=x,1", "a=0,1", "a=1,inf"] {
+            assert!(parse_lambda(wrong).is_err(), "{wrong}");
+        }
+    }
+
+    #[test]
+    fn recipes_are_called_after_the_file() {
+        assert_eq!(name_of(Path::new("runs/my model (1).h5")), "my-model--1-");
+        assert_eq!(name_of(Path::new(".h5")), "h5");
+        assert_eq!(name_of(Path::new("...")), "imported");
+    }
+}

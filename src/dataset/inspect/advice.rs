@@ -1,0 +1,192 @@
+//! What to do about what was found, in plain words.
+
+use super::suspicious::Suspicion;
+use super::{Pictures, Report, Steering};
+use crate::dataset::recording::{Camera, Kind, Reason};
+
+/// Share of labels that are exactly zero above which straight frames crowd out the bends.
+const MANY_ZEROS: f64 = 0.35;
+/// Share of zeros that the advised thinning leaves.
+const ZEROS_LEFT: f64 = 1.0 / 3.0;
+/// Turns to one side are rare below this share of all turns.
+const RARE_SIDE: f64 = 0.25;
+/// Share of labels at full lock above which driving was jerky.
+const MUCH_FULL_LOCK: f64 = 0.05;
+/// Labels of a keyboard take fewer different values than this share of the rows.
+const FEW_LABELS: f64 = 0.02;
+/// Below this number of rows, networks learn the road by heart.
+const FEW_ROWS: usize = 5000;
+/// Share of standing rows that is worth a word.
+const MUCH_STANDING: f64 = 0.01;
+/// A picture follows its label by this much, in milliseconds, where both belong together.
+const USUAL_LAG_MS: std::ops::RangeInclusive<f64> = -60.0..=250.0;
+
+/// What to do, the weightiest first.
+pub fn advice(report: &Report) -> Vec<String> {
+    let mut advice = Vec::new();
+    advice.extend(about_unusable(report));
+    if let Some(steering) = &report.steering {
+        about_labels(report.kind, steering, &mut advice);
+    }
+    about_rows(report, &mut advice);
+    if let Some(pictures) = &report.pictures {
+        about_pictures(pictures, &mut advice);
+    }
+    let contradictions: f64 =
+        report.suspicious.iter().filter(|s| s.what == Suspicion::Contradiction).map(|s| s.length_s).sum();
+    if contradictions > 0.0 {
+        advice.push(format!(
+            "{contradictions:.1} s in which the label points to the other side than the car turns: look at these lines, and take \
+             them out of the log if the driver was correcting a slide"
+        ));
+    }
+    advice
+}
+
+fn about_unusable(report: &Report) -> impl Iterator<Item = String> + '_ {
+    report.unusable.0.iter().map(|(reason, tally)| {
+        let remedy = match reason {
+            Reason::ImageMissing => "copy the whole folder IMG beside the log, or record again",
+            Reason::ImageTruncated | Reason::NotAnImage => "copy these images again; the disk may have been full",
+            Reason::LabelOutOfRange => "steering must be in [-1, 1]; divide degrees by the full-lock angle",
+            Reason::Ambiguous => "write the log with decimal points, or with a separator that is no comma",
+            Reason::TooFewFields | Reason::TooManyFields | Reason::NotANumber => "mend or delete these lines",
+        };
+        let rows = if tally.rows == 1 { "row" } else { "rows" };
+        format!("{} {rows} left out, {}: {remedy}", tally.rows, reason.text())
+    })
+}
+
+fn about_labels(kind: Kind, steering: &Steering, advice: &mut Vec<String>) {
+    let zeros = steering.zero_share;
+    let rows: usize = steering.histogram.iter().sum();
+    if zeros > 0.99 {
+        advice.push(
+            "nearly all labels are exactly zero: there is nothing to learn from; check that steering was recorded"
+                .into(),
+        );
+        return;
+    }
+    if zeros > MANY_ZEROS {
+        let keep = ZEROS_LEFT / (1.0 - ZEROS_LEFT) * (1.0 - zeros) / zeros;
+        let keep = (20.0 * keep).round().max(1.0) / 20.0;
+        advice.push(format!(
+            "{:.0} % of the labels are exactly zero: keep {:.0} % of them, with --set balance.keep_zero={keep}",
+            100.0 * zeros,
+            100.0 * keep
+        ));
+    }
+    let (left, right) = (steering.left_share, steering.right_share);
+    let turns = left + right;
+    if turns > 0.01 && left.min(right) < RARE_SIDE * turns {
+        let side = if left > right { "left" } else { "right" };
+        let share = 100.0 * left.max(right) / turns;
+        let only = if share > 99.5 {
+            format!("only {side} turns")
+        } else {
+            format!("{share:.0} % of the turns are to the {side}")
+        };
+        advice.push(format!("{only}: mirror, with --set samples.flip=random, or drive the other way round as well"));
+    }
+    if steering.full_lock_share > MUCH_FULL_LOCK {
+        advice.push(format!(
+            "{:.0} % of the labels are at full lock: drive slower, or with mouse or gamepad, so that labels say how much to steer",
+            100.0 * steering.full_lock_share
+        ));
+    }
+    if kind == Kind::Udacity && rows > 200 && (steering.distinct as f64) < FEW_LABELS * rows as f64 {
+        advice.push(format!(
+            "only {} different labels, as a keyboard gives them: mouse or gamepad give smoother ones",
+            steering.distinct
+        ));
+    }
+}
+
+fn about_rows(report: &Report, advice: &mut Vec<String>) {
+    if report.usable > 0 && report.usable < FEW_ROWS {
+        advice.push(format!(
+            "{} rows are few: record more laps, in both directions, and ways back from the edge of the road",
+            report.usable
+        ));
+    }
+    if let Some(share) = report.standing_share.filter(|share| *share > MUCH_STANDING) {
+        advice.push(format!(
+            "{:.0} % of the rows stand still: leave them out, with --set samples.min_throttle=0 or by hand",
+            100.0 * share
+        ));
+    }
+    if report.kind == Kind::Udacity && report.usable > 0 && !report.cameras.contains(&Camera::Left) {
+        advice.push("no side cameras: a car off its line is never seen, so record ways back to it".into());
+    }
+    if report.gaps.count as f64 > 0.01 * report.usable as f64 && report.gaps.count > 2 {
+        advice.push(format!(
+            "{} gaps in time: the computer was too slow while recording; lower its picture quality",
+            report.gaps.count
+        ));
+    }
+}
+
+fn about_pictures(pictures: &Pictures, advice: &mut Vec<String>) {
+    let Pictures { seen, undecodable, copies, frozen, lag } = *pictures;
+    if undecodable > 0 {
+        advice.push(format!("{undecodable} pictures cannot be decoded: copy them again, or delete their rows"));
+    }
+    if copies as f64 > 0.01 * seen as f64 {
+        advice.push(format!("{copies} pictures are copies of earlier ones: the log, or a part of it, is there twice"));
+    }
+    if frozen as f64 > 0.01 * seen as f64 {
+        advice.push(format!(
+            "{frozen} pictures are frozen while the car moves: their labels belong to pictures that were lost"
+        ));
+    }
+    if let Some(lag) = lag.filter(|lag| !USUAL_LAG_MS.contains(&lag.ms)) {
+        advice.push(format!(
+            "pictures and labels are {:.0} ms apart, usual are 0 to 200: labels stand beside the wrong pictures, or were smoothed",
+            lag.ms
+        ));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::describe;
+    use crate::dataset::testing::recording_of;
+    use std::path::Path;
+
+    fn advice(labels: &[f32]) -> Vec<String> {
+        describe(Path::new("x"), &recording_of(labels, 100), &[]).advice
+    }
+
+    #[test]
+    fn advice_names_the_figure_and_the_remedy() {
+        let mut labels: Vec<f32> = (0..440).map(|i| -0.05 - i as f32 * 0.001).collect();
+        labels.extend([0.0; 560]);
+        let found = advice(&labels);
+        assert_eq!(
+            found[0],
+            "56 % of the labels are exactly zero: keep 40 % of them, with --set balance.keep_zero=0.4"
+        );
+        assert!(found[1].starts_with("only left turns: mirror, with --set samples.flip=random"), "{found:?}");
+        assert!(found[2].starts_with("1000 rows are few"), "{found:?}");
+        // 560 of 1000 zeros, 40 % kept: 224 of 664, a third.
+        assert!((224.0f64 / 664.0 - 1.0 / 3.0).abs() < 0.01);
+    }
+
+    #[test]
+    fn a_good_recording_needs_no_advice() {
+        let labels: Vec<f32> =
+            (0..6000).map(|i| (i as f32 * 0.05).sin() * 0.3 + (i as f32 * 0.0011).sin() * 0.1).collect();
+        assert_eq!(advice(&labels), Vec::<String>::new());
+    }
+
+    #[test]
+    fn keyboards_and_full_lock_are_recognised() {
+        let labels: Vec<f32> = (0..6000).map(|i| [0.2, -0.2, 1.0, -1.0][i % 4]).collect();
+        let found = advice(&labels);
+        assert!(
+            found[0].starts_with("50 % of the labels are at full lock") && found[1].starts_with("only 4 different"),
+            "{found:?}"
+        );
+        assert!(advice(&[0.0; 6000])[0].contains("nothing to learn"));
+    }
+}

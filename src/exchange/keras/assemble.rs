@@ -1,0 +1,310 @@
+//! From translated layers and their tensors to a network with parameters: shapes, and the order of the numbers.
+//!
+//! Keras (with TensorFlow's order of axes) keeps maps as height, width, channel, and its `Flatten` gives vectors in that order;
+//! here both are channel, height, width. Kernels and everything that comes after a flatten are permuted accordingly.
+
+use steersman_kernels::Isa;
+
+use super::Problem;
+use super::architecture::KerasLayer;
+use super::file::Tensor;
+use super::translate::{AxisOrder, KernelLayout, Operation, Step};
+use crate::layers::Slopes;
+use crate::network::{LayerSpec, Parameters};
+use crate::tensor::{Initializer, Shape};
+
+/// Most numbers of an imported network: 256 MiB.
+const MAX_NUMBERS: usize = 1 << 26;
+
+/// The result.
+pub(super) struct Assembly {
+    pub specs: Vec<LayerSpec>,
+    pub parameters: Parameters,
+    /// How many of `specs` stand for each Keras layer and those before it.
+    pub ends: Vec<usize>,
+}
+
+/// What holds for the whole file.
+pub(super) struct Context {
+    pub input: Shape,
+    pub order: AxisOrder,
+    /// Kernels are turned by 180 degrees, as Theano's convolution did it.
+    pub flip_kernels: bool,
+}
+
+/// Puts the chain together.
+///
+/// # Errors
+///
+/// The first layer that does not fit: those behind it depend on its output.
+pub(super) fn assemble(
+    context: &Context,
+    layers: &[KerasLayer],
+    steps: &[Step],
+    tensors: &[Vec<Tensor>],
+) -> Result<Assembly, Problem> {
+    let mut assembler = Assembler {
+        context,
+        shape: context.input,
+        is_flat: false,
+        interleaved: None,
+        specs: Vec::new(),
+        parameters: Parameters { values: Vec::new(), statistics: Vec::new() },
+    };
+    let mut ends = Vec::new();
+    for ((layer, step), tensors) in layers.iter().zip(steps).zip(tensors) {
+        assembler.step(step, tensors).map_err(|reason| layer.problem(reason))?;
+        ends.push(assembler.specs.len());
+    }
+    Ok(Assembly { specs: assembler.specs, parameters: assembler.parameters, ends })
+}
+
+struct Assembler<'a> {
+    context: &'a Context,
+    /// Output of the layers so far.
+    shape: Shape,
+    /// The output is a vector in Keras, too.
+    is_flat: bool,
+    /// The map whose numbers the vector has, in the order height, width, channel.
+    interleaved: Option<Shape>,
+    specs: Vec<LayerSpec>,
+    parameters: Parameters,
+}
+
+impl Assembler<'_> {
+    fn step(&mut self, step: &Step, tensors: &[Tensor]) -> Result<(), String> {
+        match &step.operation {
+            Operation::Nothing | Operation::Input => {}
+            Operation::Plain(spec) => {
+                if matches!(spec, LayerSpec::ZeroPad { .. } | LayerSpec::Crop { .. }) {
+                    self.needs_map()?;
+                }
+                self.push(spec.clone(), Vec::new(), Vec::new())?;
+            }
+            Operation::Conv { spec, kernel, bias } => self.conv(spec, *kernel, *bias, tensors)?,
+            Operation::Dense { units, bias } => self.dense(*units, *bias, tensors)?,
+            Operation::BatchNorm { spec, axis, center, scale } => {
+                self.batch_norm(spec, *axis, [*scale, *center], tensors)?;
+            }
+            Operation::PRelu => self.prelu(tensors)?,
+            Operation::Pool { max, window, stride, same } => self.pool(*max, *window, *stride, *same)?,
+            Operation::GlobalPool { max } => {
+                self.needs_map()?;
+                self.pool(*max, [self.shape.h, self.shape.w], [1, 1], false)?;
+                self.is_flat = true;
+            }
+            Operation::Flatten => self.flatten(step.order)?,
+        }
+        match &step.activation {
+            Some(activation) => self.push(activation.clone(), Vec::new(), Vec::new()),
+            None => Ok(()),
+        }
+    }
+
+    fn push(&mut self, spec: LayerSpec, values: Vec<f32>, statistics: Vec<f32>) -> Result<(), String> {
+        let layer = spec.build(self.shape, Isa::PORTABLE)?;
+        let count = |specs: Vec<crate::layers::ParamSpec>| specs.iter().map(|spec| spec.len()).sum::<usize>();
+        debug_assert_eq!((count(layer.params()), count(layer.statistics())), (values.len(), statistics.len()));
+        if self.parameters.values.len() + values.len() > MAX_NUMBERS {
+            return Err(format!("the network would have more than {MAX_NUMBERS} parameters"));
+        }
+        self.parameters.values.extend(values);
+        self.parameters.statistics.extend(statistics);
+        self.shape = layer.output();
+        self.specs.push(spec);
+        Ok(())
+    }
+
+    fn needs_map(&self) -> Result<(), String> {
+        if self.is_flat { Err("needs a map, but comes behind a flattened one".into()) } else { Ok(()) }
+    }
+
+    fn conv(&mut self, spec: &LayerSpec, layout: KernelLayout, bias: bool, tensors: &[Tensor]) -> Result<(), String> {
+        self.needs_map()?;
+        let LayerSpec::Conv2d { filters: oc, kernel: [kh, kw], .. } = *spec else {
+            unreachable!("a convolution is translated into one");
+        };
+        // Checks the sizes before anything is read.
+        spec.build(self.shape, Isa::PORTABLE)?;
+        let ic = self.shape.c;
+        let kernel_shape = match layout {
+            KernelLayout::HeightWidthInOut => [kh, kw, ic, oc],
+            KernelLayout::OutInHeightWidth => [oc, ic, kh, kw],
+        };
+        let mut read = expect(tensors, &[Some(&kernel_shape), bias.then_some(&[oc])])?.into_iter();
+        let (kernel, bias) = (read.next().flatten().unwrap_or_default(), read.next().flatten());
+        let mut values = Vec::with_capacity(kernel.len() + oc);
+        for o in 0..oc {
+            for i in 0..ic {
+                for y in 0..kh {
+                    for x in 0..kw {
+                        let (y, x) = if self.context.flip_kernels { (kh - 1 - y, kw - 1 - x) } else { (y, x) };
+                        values.push(match layout {
+                            KernelLayout::HeightWidthInOut => kernel[((y * kw + x) * ic + i) * oc + o],
+                            KernelLayout::OutInHeightWidth => kernel[((o * ic + i) * kh + y) * kw + x],
+                        });
+                    }
+                }
+            }
+        }
+        values.extend(bias.unwrap_or_else(|| vec![0.0; oc]));
+        self.push(spec.clone(), values, Vec::new())
+    }
+
+    fn dense(&mut self, units: usize, bias: bool, tensors: &[Tensor]) -> Result<(), String> {
+        let init = Initializer::default();
+        // Keras' dense layer works on the last axis: on a map it is a convolution with a kernel of one position.
+        let on_map = !self.is_flat && self.shape.positions() > 1;
+        if on_map && self.context.order == AxisOrder::ChannelsFirst {
+            return Err("works on the columns of a map, which has no counterpart".into());
+        }
+        let spec = match on_map {
+            true => {
+                LayerSpec::Conv2d { filters: units, kernel: [1, 1], stride: [1, 1], padding: Default::default(), init }
+            }
+            false => LayerSpec::Dense { units, init },
+        };
+        spec.build(self.shape, Isa::PORTABLE)?;
+        let inputs = if on_map { self.shape.c } else { self.shape.len() };
+        let mut read = expect(tensors, &[Some(&[inputs, units]), bias.then_some(&[units])])?.into_iter();
+        let (kernel, bias) = (read.next().flatten().unwrap_or_default(), read.next().flatten());
+        let places = self.interleaved.take().map_or_else(|| (0..inputs).collect(), interleaved_places);
+        let mut values = Vec::with_capacity(kernel.len() + units);
+        for unit in 0..units {
+            values.extend(places.iter().map(|place| kernel[place * units + unit]));
+        }
+        values.extend(bias.unwrap_or_else(|| vec![0.0; units]));
+        self.push(spec, values, Vec::new())
+    }
+
+    fn batch_norm(
+        &mut self,
+        spec: &LayerSpec,
+        axis: i64,
+        [scale, center]: [bool; 2],
+        tensors: &[Tensor],
+    ) -> Result<(), String> {
+        let axes = if self.is_flat { 2 } else { 4 };
+        let channels = if self.is_flat || self.context.order == AxisOrder::ChannelsFirst { 1 } else { 3 };
+        if axis != channels && axis != channels - axes {
+            return Err(format!("normalises axis {axis}, which is not that of the channels"));
+        }
+        let epsilon = match spec {
+            LayerSpec::BatchNorm { epsilon, .. } => *epsilon,
+            _ => unreachable!("batch normalisation is translated into itself"),
+        };
+        let c: &[usize] = &[self.shape.c];
+        let read = expect(tensors, &[scale.then_some(c), center.then_some(c), Some(c), Some(c)])?;
+        let permute = |values: Vec<f32>| match self.interleaved {
+            Some(map) => interleaved_places(map).into_iter().map(|place| values[place]).collect(),
+            None => values,
+        };
+        let mut read = read.into_iter().map(|values| values.map(permute));
+        let mut next = |default: f32| read.next().flatten().unwrap_or_else(|| vec![default; c[0]]);
+        let (gamma, beta, mean, variance) = (next(1.0), next(0.0), next(0.0), next(1.0));
+        if variance.iter().any(|variance| variance + epsilon <= 0.0) {
+            return Err("a running variance is negative".into());
+        }
+        self.push(spec.clone(), [gamma, beta].concat(), [mean, variance].concat())
+    }
+
+    fn prelu(&mut self, tensors: &[Tensor]) -> Result<(), String> {
+        let Shape { c, h, w } = self.shape;
+        let [tensor] = tensors else {
+            return Err(format!("has {} tensors in the file, not 1", tensors.len()));
+        };
+        let found = tensor.shape();
+        let full = match (self.is_flat, self.context.order) {
+            (true, _) => vec![c],
+            (false, AxisOrder::ChannelsLast) => vec![h, w, c],
+            (false, AxisOrder::ChannelsFirst) => vec![c, h, w],
+        };
+        let fits =
+            found.len() == full.len() && found.iter().zip(&full).all(|(found, full)| found == full || *found == 1);
+        if !fits {
+            return Err(unfitting(&tensor.name, &found, &full));
+        }
+        if c * h * w > MAX_NUMBERS {
+            return Err(format!("would have more than {MAX_NUMBERS} slopes"));
+        }
+        let slopes = tensor.read()?;
+        // Index of the slope at a channel, row and column; an axis of length 1 is shared.
+        let slope = |[c, y, x]: [usize; 3]| {
+            let place = match (self.is_flat, self.context.order) {
+                (true, _) => vec![c],
+                (false, AxisOrder::ChannelsLast) => vec![y, x, c],
+                (false, AxisOrder::ChannelsFirst) => vec![c, y, x],
+            };
+            let steps = found.iter().zip(place);
+            slopes[steps.fold(0, |index, (extent, place)| index * extent + if *extent == 1 { 0 } else { place })]
+        };
+        let per_channel = !self.is_flat && found.iter().product::<usize>() == c && slopes.len() == c && h * w > 1;
+        if per_channel && found[if self.context.order == AxisOrder::ChannelsLast { 2 } else { 0 }] == c {
+            let spec = LayerSpec::PRelu { slopes: Slopes::PerChannel, initial_slope: 0.0 };
+            return self.push(spec, slopes, Vec::new());
+        }
+        let values = match self.interleaved {
+            Some(map) if found[0] == c => interleaved_places(map).into_iter().map(|place| slopes[place]).collect(),
+            _ => (0..c * h * w).map(|i| slope([i / (h * w), i / w % h, i % w])).collect(),
+        };
+        self.push(LayerSpec::PRelu { slopes: Slopes::PerPosition, initial_slope: 0.0 }, values, Vec::new())
+    }
+
+    fn pool(&mut self, max: bool, window: [usize; 2], stride: [usize; 2], same: bool) -> Result<(), String> {
+        self.needs_map()?;
+        let needs_padding = |size: usize, window: usize, stride: usize| {
+            stride > 0 && (size.div_ceil(stride) - 1).saturating_mul(stride).saturating_add(window) > size
+        };
+        let Shape { h, w, .. } = self.shape;
+        if same && (needs_padding(h, window[0], stride[0]) || needs_padding(w, window[1], stride[1])) {
+            return Err(format!("pads the border of its {h}x{w} input, which has no counterpart in pooling"));
+        }
+        let stride = (stride != window).then_some(stride);
+        let spec = if max { LayerSpec::MaxPool { window, stride } } else { LayerSpec::AveragePool { window, stride } };
+        self.push(spec, Vec::new(), Vec::new())
+    }
+
+    fn flatten(&mut self, order: Option<AxisOrder>) -> Result<(), String> {
+        if self.is_flat {
+            return Ok(());
+        }
+        let interleaves = match (self.context.order, order) {
+            (AxisOrder::ChannelsLast, None | Some(AxisOrder::ChannelsLast)) => true,
+            // With its own `data_format`, it moves the channels behind before it flattens.
+            (AxisOrder::ChannelsFirst, Some(AxisOrder::ChannelsFirst)) => true,
+            (AxisOrder::ChannelsFirst, _) => false,
+            (AxisOrder::ChannelsLast, _) => return Err("flattens in another order of axes than the maps have".into()),
+        };
+        self.interleaved = Some(self.shape).filter(|map| interleaves && map.positions() > 1);
+        self.is_flat = true;
+        self.push(LayerSpec::Flatten {}, Vec::new(), Vec::new())
+    }
+}
+
+/// For each number of a map in the order channel, row, column: its place in the order row, column, channel.
+fn interleaved_places(Shape { c, h, w }: Shape) -> Vec<usize> {
+    (0..c * h * w).map(|i| (i % (h * w)) * c + i / (h * w)).collect()
+}
+
+/// Reads the tensors of a layer, which must have the shapes that are given; `None` in `shapes` is a tensor that it goes without.
+fn expect(tensors: &[Tensor], shapes: &[Option<&[usize]>]) -> Result<Vec<Option<Vec<f32>>>, String> {
+    let count = shapes.iter().flatten().count();
+    if tensors.len() != count {
+        return Err(format!("has {} tensors in the file, not {count}", tensors.len()));
+    }
+    let mut tensors = tensors.iter();
+    let mut read = |shape: &Option<&[usize]>| -> Result<Option<Vec<f32>>, String> {
+        let Some(shape) = shape else { return Ok(None) };
+        let Some(tensor) = tensors.next() else { return Ok(None) };
+        let found = tensor.shape();
+        if found != *shape {
+            return Err(unfitting(&tensor.name, &found, shape));
+        }
+        tensor.read().map(Some)
+    };
+    shapes.iter().map(&mut read).collect()
+}
+
+fn unfitting(name: &str, found: &[usize], expected: &[usize]) -> String {
+    format!("tensor `{name}` has shape {found:?}; the architecture says {expected:?}")
+}

@@ -1,0 +1,239 @@
+//! Models that Keras saved: HDF5 of Keras 1 and 2, and the `.keras` archive of Keras 3.
+//!
+//! The way of a file: `file` opens it and finds architecture and weights; `architecture` reads the JSON into a chain of
+//! layers; `translate` says what each layer means here, `lambda` what a `Lambda` computes; `assemble` follows the shapes
+//! and brings the numbers into our order. Everything in a file is data and nothing in it is believed: what does not fit is an
+//! error that names the layer.
+//!
+//! What a file does not say is how an image becomes the network's input: colour space, crop, and often the scaling.
+
+mod architecture;
+mod assemble;
+mod file;
+mod lambda;
+mod marshal;
+mod translate;
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+
+use serde::Serialize;
+use steersman_kernels::Isa;
+
+use self::assemble::{Assembly, Context};
+use self::file::KerasFile;
+use self::lambda::Affine;
+use self::translate::{AxisOrder, Operation, Step};
+use crate::dataset::preprocess::Preprocessing;
+use crate::error::{Error, Result};
+use crate::model_file::{Model, TrainingRecord};
+use crate::network::{LayerSpec, Network, Parameters};
+use crate::recipe::Recipe;
+use crate::tensor::Shape;
+
+/// What the user knows beside the file.
+#[derive(Clone, Debug, Default)]
+pub struct ImportOptions {
+    /// The architecture's JSON, for files that hold weights only; taken before the one in the file.
+    pub architecture: Option<PathBuf>,
+    /// What `Lambda` layers compute, by name: a and b of x / a − b.
+    pub lambdas: BTreeMap<String, (f64, f64)>,
+    /// The weights were trained on Theano, whose convolution turned its kernels by 180 degrees. Files since Keras 2 say so
+    /// themselves.
+    pub theano_kernels: bool,
+    /// Shape of the input for files that leave it out.
+    pub input: Option<Shape>,
+}
+
+/// An imported network.
+#[derive(Clone, Debug)]
+pub struct Imported {
+    /// Shape of one input image.
+    pub input: Shape,
+    /// The layers.
+    pub layers: Vec<LayerSpec>,
+    /// Their numbers.
+    pub parameters: Parameters,
+    /// Version of Keras that wrote the file, if it says.
+    pub keras_version: Option<String>,
+    /// What became of each layer of the file.
+    pub report: Vec<LayerReport>,
+    /// What the user should know.
+    pub notices: Vec<String>,
+}
+
+impl Imported {
+    /// The model called `name` that sees images through `preprocessing`. Its recipe has Adam at a small rate, for training it
+    /// further.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Usage`] if `preprocessing` gives another shape than the network takes; [`Error::Recipe`] and
+    /// [`Error::Network`] if the network gives more than one number.
+    pub fn into_model(self, name: &str, preprocessing: Preprocessing) -> Result<Model> {
+        let [c, h, w] = preprocessing.output();
+        if Shape::new(c, h, w) != self.input {
+            let Shape { c: planes, h: rows, w: columns } = self.input;
+            return Err(Error::Usage(format!(
+                "the network takes images of {rows}x{columns} with {planes} colour planes, the preprocessing gives {h}x{w} \
+                 with {c}: set its resize and colour accordingly"
+            )));
+        }
+        let version = self.keras_version.map_or(String::new(), |version| format!(" {version}"));
+        let table = |e: toml::ser::Error| Error::Recipe { recipe: name.into(), message: e.to_string() };
+        let optimizer = toml::toml! {
+            kind = "adam"
+            learning_rate = 1e-4
+        };
+        let mut recipe = toml::Table::new();
+        recipe.insert("name".into(), name.into());
+        recipe.insert("about".into(), format!("imported from Keras{version}").into());
+        recipe.insert("epochs".into(), 10.into());
+        recipe.insert("batch".into(), 64.into());
+        recipe.insert("layers".into(), toml::Value::try_from(&self.layers).map_err(table)?);
+        recipe.insert("preprocessing".into(), toml::Value::try_from(&preprocessing).map_err(table)?);
+        recipe.insert("optimizer".into(), optimizer.into());
+        let recipe = Recipe::parse(name, &recipe.to_string(), &[])?;
+        let record = TrainingRecord { version: env!("CARGO_PKG_VERSION").into(), ..TrainingRecord::default() };
+        Ok(Model { recipe, parameters: self.parameters, record, training_rows: Vec::new() })
+    }
+}
+
+/// What became of a layer.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct LayerReport {
+    /// Its name in the file.
+    pub layer: String,
+    /// Its class in the file.
+    pub class: String,
+    /// Names of the layers that stand for it.
+    pub becomes: Vec<String>,
+}
+
+/// Why a layer cannot be imported.
+#[derive(Clone, Debug, PartialEq)]
+struct Problem {
+    layer: String,
+    class: String,
+    reason: String,
+}
+
+/// Reads the model in `path`.
+///
+/// # Errors
+///
+/// [`Error::Io`] if a file cannot be read; [`Error::Data`] if it is damaged, is no model of Keras, or has layers without a
+/// counterpart, all of which are listed with the reason.
+pub fn import(path: &Path, options: &ImportOptions) -> Result<Imported> {
+    let file = KerasFile::open(path)?;
+    let wrong = |message: String| Error::data(path, message);
+    let (place, text) = match (&options.architecture, &file.architecture) {
+        (Some(json), _) => (json.as_path(), read_architecture(json)?),
+        (None, Some(text)) => (path, text.clone()),
+        (None, None) => {
+            return Err(wrong(
+                "has weights only; give the architecture that Keras' to_json wrote: --architecture FILE.json".into(),
+            ));
+        }
+    };
+    let chain = architecture::chain(&text).map_err(|message| Error::data(place, message))?;
+    let mut unknown: BTreeSet<&String> = options.lambdas.keys().collect();
+
+    let mut problems = chain.problems;
+    let mut steps = Vec::new();
+    for layer in &chain.layers {
+        unknown.remove(&layer.name);
+        let known = options.lambdas.get(&layer.name).map(|(a, b)| Affine { factor: 1.0 / a, offset: -b });
+        match translate::translate(layer, known) {
+            Ok(step) => steps.push(step),
+            Err(reason) if problems.iter().all(|problem| problem.layer != layer.name) => {
+                problems.push(layer.problem(reason));
+            }
+            Err(_) => {}
+        }
+    }
+    if let Some(name) = unknown.first() {
+        return Err(wrong(format!("has no layer `{name}`, which --lambda names")));
+    }
+    let order = axis_order(&chain.layers, &steps, &mut problems);
+    if !problems.is_empty() {
+        return Err(wrong(listed(&problems)));
+    }
+
+    let input = input_shape(&steps, order, options.input).map_err(wrong)?;
+    let has_weights: Vec<bool> = steps.iter().map(|step| step.operation.has_weights()).collect();
+    let tensors = file.weights.of_chain(&chain.layers, &has_weights).map_err(wrong)?;
+    let flip_kernels = options.theano_kernels || file.backend.as_deref() == Some("theano");
+    let context = Context { input, order, flip_kernels };
+    let assembly = assemble::assemble(&context, &chain.layers, &steps, &tensors).map_err(|p| wrong(listed(&[p])))?;
+    let Assembly { specs, parameters, ends } = assembly;
+    let network = Network::new(input, &specs, Isa::PORTABLE)?;
+
+    let mut notices = Vec::new();
+    let mut report = Vec::new();
+    let mut start = 0;
+    for ((layer, step), end) in chain.layers.iter().zip(&steps).zip(ends) {
+        let becomes = network.layers()[start..end].iter().map(|layer| layer.name.clone()).collect();
+        report.push(LayerReport { layer: layer.name.clone(), class: layer.class.clone(), becomes });
+        notices.extend(step.notice.map(|notice| format!("{} ({}): {notice}", layer.name, layer.class)));
+        start = end;
+    }
+    if order == AxisOrder::ChannelsFirst && file.backend.is_none() && !flip_kernels {
+        notices.push(
+            "the file does not say whether it was trained on Theano, whose kernels are turned by 180 degrees: \
+             if it steers badly, try --theano-kernels"
+                .into(),
+        );
+    }
+    Ok(Imported { input, layers: specs, parameters, keras_version: file.keras_version, report, notices })
+}
+
+/// Architectures are kilobytes long.
+const MAX_ARCHITECTURE_BYTES: u64 = 64 << 20;
+
+fn read_architecture(path: &Path) -> Result<String> {
+    let len = std::fs::metadata(path).map_err(Error::io(path))?.len();
+    if len > MAX_ARCHITECTURE_BYTES {
+        return Err(Error::data(path, format!("has {len} bytes, which is no architecture")));
+    }
+    std::fs::read_to_string(path).map_err(Error::io(path))
+}
+
+fn listed(problems: &[Problem]) -> String {
+    let mut text = match problems.len() {
+        1 => "a layer cannot be imported:".to_string(),
+        count => format!("{count} layers cannot be imported:"),
+    };
+    for Problem { layer, class, reason } in problems {
+        text += &format!("\n  {layer} ({class}): {reason}");
+    }
+    text
+}
+
+/// The order of axes that all layers of the chain agree on.
+fn axis_order(layers: &[architecture::KerasLayer], steps: &[Step], problems: &mut Vec<Problem>) -> AxisOrder {
+    // Flatten has an order of its own.
+    let says = |step: &Step| step.order.filter(|_| step.operation != Operation::Flatten);
+    let order = steps.iter().find_map(says).unwrap_or(AxisOrder::ChannelsLast);
+    if layers.len() == steps.len() {
+        for (layer, _) in layers.iter().zip(steps).filter(|(_, step)| says(step).is_some_and(|own| own != order)) {
+            problems.push(layer.problem("has another order of axes than the layers before it"));
+        }
+    }
+    order
+}
+
+/// Shape of the input: what the file says, or else what the user's preprocessing gives.
+fn input_shape(steps: &[Step], order: AxisOrder, given: Option<Shape>) -> Result<Shape, String> {
+    let said = steps.iter().find_map(|step| step.input.as_ref());
+    match said.map(Vec::as_slice) {
+        Some(&[a, b, c]) if a > 0 && b > 0 && c > 0 => Ok(match order {
+            AxisOrder::ChannelsLast => Shape::new(c, a, b),
+            AxisOrder::ChannelsFirst => Shape::new(a, b, c),
+        }),
+        Some(extents) if extents.len() != 3 => Err(format!("its input has the shape {extents:?}, which is no image")),
+        _ => given.ok_or_else(|| {
+            "does not say how large its input is: give the preprocessing, whose size it then is, with --preprocessing".into()
+        }),
+    }
+}

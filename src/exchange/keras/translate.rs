@@ -1,0 +1,463 @@
+//! What each Keras layer means here, from its options alone; shapes and weights come later.
+
+use serde_json::{Map, Value};
+
+use super::architecture::KerasLayer;
+use super::lambda::{self, Affine};
+use crate::layers::Padding;
+use crate::network::LayerSpec;
+use crate::tensor::Initializer;
+
+/// Order of the axes of a feature map.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum AxisOrder {
+    /// Height, width, channels (`tf`).
+    ChannelsLast,
+    /// Channels, height, width (`th`).
+    ChannelsFirst,
+}
+
+/// How the numbers of a convolution's kernel lie in the file.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum KernelLayout {
+    /// Height, width, inputs, outputs.
+    HeightWidthInOut,
+    /// Outputs, inputs, height, width: Keras 1 with `dim_ordering` `th`.
+    OutInHeightWidth,
+}
+
+/// What a layer does before its activation.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) enum Operation {
+    /// Nothing that evaluation or training would see.
+    Nothing,
+    /// The input; extents without the batch, if the file gives them.
+    Input,
+    /// A layer without weights that is the same for every shape.
+    Plain(LayerSpec),
+    Conv {
+        spec: LayerSpec,
+        kernel: KernelLayout,
+        bias: bool,
+    },
+    Dense {
+        units: usize,
+        bias: bool,
+    },
+    BatchNorm {
+        spec: LayerSpec,
+        axis: i64,
+        center: bool,
+        scale: bool,
+    },
+    PRelu,
+    Pool {
+        max: bool,
+        window: [usize; 2],
+        stride: [usize; 2],
+        same: bool,
+    },
+    GlobalPool {
+        max: bool,
+    },
+    Flatten,
+}
+
+impl Operation {
+    /// Whether the file has tensors for it.
+    pub fn has_weights(&self) -> bool {
+        matches!(
+            self,
+            Operation::Conv { .. } | Operation::Dense { .. } | Operation::BatchNorm { .. } | Operation::PRelu
+        )
+    }
+}
+
+/// A translated layer.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Step {
+    pub operation: Operation,
+    /// What follows, without weights.
+    pub activation: Option<LayerSpec>,
+    /// Order of the axes, if the layer says.
+    pub order: Option<AxisOrder>,
+    /// Extents of the input without the batch, in the order of the file, if the layer says; 0 where they are open.
+    pub input: Option<Vec<usize>>,
+    /// What is lost, for the user.
+    pub notice: Option<&'static str>,
+}
+
+/// What `layer` means here; `known` is what the user says that it computes.
+///
+/// # Errors
+///
+/// Why it has no counterpart.
+pub(super) fn translate(layer: &KerasLayer, known: Option<Affine>) -> Result<Step, String> {
+    let options = Options(&layer.config);
+    let mut notice = None;
+    let mut activation = None;
+    let operation = match layer.class.as_str() {
+        "InputLayer" => Operation::Input,
+        "Lambda" => {
+            let Affine { factor, offset } = match known {
+                Some(known) => known,
+                None => lambda::function(&layer.config).map_err(|reason| {
+                    format!("{reason}; if it is x / A - B, say so with --lambda {}=A,B", layer.name)
+                })?,
+            };
+            Operation::Plain(LayerSpec::Scale { factor: factor as f32, offset: offset as f32 })
+        }
+        "Rescaling" => {
+            let (factor, offset) = (options.number(&["scale"], 1.0)?, options.number(&["offset"], 0.0)?);
+            Operation::Plain(LayerSpec::Scale { factor: factor as f32, offset: offset as f32 })
+        }
+        "Conv2D" | "Convolution2D" => {
+            activation = options.activation()?;
+            conv(&options)?
+        }
+        "Dense" => {
+            activation = options.activation()?;
+            Operation::Dense {
+                units: options.size(&["units", "output_dim"])?,
+                bias: options.flag(&["use_bias", "bias"], true)?,
+            }
+        }
+        "BatchNormalization" => {
+            if options.number(&["mode"], 0.0)? != 0.0 {
+                return Err("mode 1 and 2 of Keras 1's batch normalisation have no counterpart".into());
+            }
+            let old_weight = options.number(&["momentum"], 0.99)?;
+            Operation::BatchNorm {
+                spec: LayerSpec::BatchNorm {
+                    epsilon: options.number(&["epsilon"], 1e-3)? as f32,
+                    running_old_weight: old_weight as f32,
+                },
+                axis: options.axis()?,
+                center: options.flag(&["center"], true)?,
+                scale: options.flag(&["scale"], true)?,
+            }
+        }
+        "PReLU" => Operation::PRelu,
+        "MaxPooling2D" | "MaxPool2D" => pool(&options, true)?,
+        "AveragePooling2D" | "AvgPool2D" => pool(&options, false)?,
+        "GlobalAveragePooling2D" | "GlobalMaxPooling2D" => {
+            if options.flag(&["keepdims"], false)? {
+                return Err("keepdims has no counterpart".into());
+            }
+            Operation::GlobalPool { max: layer.class == "GlobalMaxPooling2D" }
+        }
+        "ZeroPadding2D" => {
+            let [rows, columns] = options.border(&["padding"])?;
+            Operation::Plain(LayerSpec::ZeroPad { rows, columns })
+        }
+        "Cropping2D" => {
+            let [rows, columns] = options.border(&["cropping"])?;
+            Operation::Plain(LayerSpec::Crop { rows, columns })
+        }
+        "Flatten" => Operation::Flatten,
+        "Dropout" | "SpatialDropout2D" => {
+            if layer.class != "Dropout" {
+                notice = Some("drops whole channels in training; here it drops single numbers");
+            }
+            Operation::Plain(LayerSpec::Dropout { drop_probability: options.number(&["rate", "p"], 0.0)? as f32 })
+        }
+        "GaussianNoise" | "GaussianDropout" | "AlphaDropout" | "ActivityRegularization" => {
+            notice = Some("acts in training only, and is left out");
+            Operation::Nothing
+        }
+        "Activation" => {
+            activation = options.activation()?;
+            Operation::Nothing
+        }
+        class => match pointwise(class, &options)? {
+            Some(spec) => Operation::Plain(spec),
+            None => return Err(without_counterpart(class).into()),
+        },
+    };
+    Ok(Step { operation, activation, order: options.order()?, input: options.input()?, notice })
+}
+
+/// Why a class cannot be imported.
+fn without_counterpart(class: &str) -> &'static str {
+    match class {
+        "TimeDistributed" | "LSTM" | "GRU" | "SimpleRNN" | "ConvLSTM2D" | "Bidirectional" | "Embedding" | "Masking" => {
+            "works on sequences of frames; a model here sees one frame at a time"
+        }
+        "Sequential" | "Model" | "Functional" => "is a model inside the model",
+        "Merge" | "Add" | "Concatenate" | "Multiply" | "Average" | "Maximum" | "Subtract" | "Dot" => {
+            "joins several branches; only a chain of layers can be imported"
+        }
+        "Reshape" | "Permute" | "RepeatVector" => "moves numbers about in a way that has no counterpart",
+        "SeparableConv2D" | "SeparableConvolution2D" | "DepthwiseConv2D" => "separable convolution has no counterpart",
+        "Deconvolution2D" | "Conv2DTranspose" | "UpSampling2D" | "Resizing" => "enlarging a map has no counterpart",
+        "AtrousConvolution2D" => "a kernel with holes has no counterpart",
+        class if class.ends_with("1D") || class.ends_with("3D") => "works on one or three dimensions, not on images",
+        _ => "has no counterpart",
+    }
+}
+
+/// An activation that is a layer of its own, or is named by one.
+fn pointwise(class: &str, options: &Options) -> Result<Option<LayerSpec>, String> {
+    Ok(Some(match class {
+        "ELU" => LayerSpec::Elu { alpha: options.number(&["alpha"], 1.0)? as f32 },
+        "LeakyReLU" => LayerSpec::LeakyRelu { slope: options.number(&["negative_slope", "alpha"], 0.3)? as f32 },
+        "ReLU" => {
+            if options.0.get("max_value").is_some_and(|value| !value.is_null()) {
+                return Err("a rectifier with a ceiling has no counterpart".into());
+            }
+            if options.number(&["threshold"], 0.0)? != 0.0 {
+                return Err("a rectifier with a threshold has no counterpart".into());
+            }
+            match options.number(&["negative_slope"], 0.0)? {
+                0.0 => LayerSpec::Relu {},
+                slope => LayerSpec::LeakyRelu { slope: slope as f32 },
+            }
+        }
+        _ => return Ok(None),
+    }))
+}
+
+fn conv(options: &Options) -> Result<Operation, String> {
+    if options.pair(&["dilation_rate", "atrous_rate"])?.unwrap_or([1, 1]) != [1, 1] {
+        return Err("a kernel with holes (dilation) has no counterpart".into());
+    }
+    if options.number(&["groups"], 1.0)? != 1.0 {
+        return Err("convolution in groups has no counterpart".into());
+    }
+    let kernel = match options.pair(&["kernel_size"])? {
+        Some(kernel) => kernel,
+        None => [options.size(&["nb_row"])?, options.size(&["nb_col"])?],
+    };
+    let padding = if options.same_padding()? { Padding::Same } else { Padding::Valid };
+    let stride = options.pair(&["strides", "subsample"])?.unwrap_or([1, 1]);
+    let filters = options.size(&["filters", "nb_filter"])?;
+    let theano = options.0.get("dim_ordering").and_then(Value::as_str) == Some("th");
+    Ok(Operation::Conv {
+        spec: LayerSpec::Conv2d { filters, kernel, stride, padding, init: Initializer::default() },
+        kernel: if theano { KernelLayout::OutInHeightWidth } else { KernelLayout::HeightWidthInOut },
+        bias: options.flag(&["use_bias", "bias"], true)?,
+    })
+}
+
+fn pool(options: &Options, max: bool) -> Result<Operation, String> {
+    let window = options.pair(&["pool_size"])?.unwrap_or([2, 2]);
+    let stride = options.pair(&["strides"])?.unwrap_or(window);
+    Ok(Operation::Pool { max, window, stride, same: options.same_padding()? })
+}
+
+/// The options of a layer; each may have several names, of which the newest comes first.
+struct Options<'a>(&'a Map<String, Value>);
+
+impl<'a> Options<'a> {
+    /// The first of `names` that is there and not null.
+    fn find(&self, names: &[&'static str]) -> Option<(&'static str, &'a Value)> {
+        names.iter().find_map(|name| self.0.get(*name).filter(|value| !value.is_null()).map(|value| (*name, value)))
+    }
+
+    fn number(&self, names: &[&'static str], default: f64) -> Result<f64, String> {
+        let Some((name, value)) = self.find(names) else { return Ok(default) };
+        // Keras 3 writes some numbers as arrays: {"class_name": "__numpy__", "config": {"value": 0.3}}.
+        let value = value.pointer("/config/value").unwrap_or(value);
+        let number = value.as_f64().filter(|number| number.is_finite());
+        number.ok_or_else(|| format!("`{name}` must be a number, not {}", short(value)))
+    }
+
+    fn flag(&self, names: &[&'static str], default: bool) -> Result<bool, String> {
+        let Some((name, value)) = self.find(names) else { return Ok(default) };
+        value.as_bool().ok_or_else(|| format!("`{name}` must be true or false, not {}", short(value)))
+    }
+
+    fn size(&self, names: &[&'static str]) -> Result<usize, String> {
+        let (name, value) = self.find(names).ok_or_else(|| format!("has no `{}`", names[0]))?;
+        size(value).ok_or_else(|| format!("`{name}` must be a whole number, not {}", short(value)))
+    }
+
+    /// Height and width; one number stands for both.
+    fn pair(&self, names: &[&'static str]) -> Result<Option<[usize; 2]>, String> {
+        let Some((name, value)) = self.find(names) else { return Ok(None) };
+        pair(value).map(Some).ok_or_else(|| format!("`{name}` must be two whole numbers, not {}", short(value)))
+    }
+
+    /// [top, bottom] and [left, right]: one number, [height, width], [top, bottom, left, right] or two pairs.
+    fn border(&self, names: &[&'static str]) -> Result<[[usize; 2]; 2], String> {
+        let (name, value) = self.find(names).ok_or_else(|| format!("has no `{}`", names[0]))?;
+        let found = match value.as_array().map(Vec::as_slice) {
+            Some([top, bottom, left, right]) => {
+                let sizes = [top, bottom, left, right].map(size);
+                sizes.iter().all(Option::is_some).then(|| {
+                    let [top, bottom, left, right] = sizes.map(Option::unwrap_or_default);
+                    [[top, bottom], [left, right]]
+                })
+            }
+            Some([rows @ Value::Array(_), columns @ Value::Array(_)]) => {
+                pair(rows).and_then(|rows| pair(columns).map(|columns| [rows, columns]))
+            }
+            _ => pair(value).map(|[h, w]| [[h, h], [w, w]]),
+        };
+        found
+            .ok_or_else(|| format!("`{name}` must be whole numbers for top, bottom, left, right, not {}", short(value)))
+    }
+
+    fn same_padding(&self) -> Result<bool, String> {
+        match self.find(&["padding", "border_mode"]).map(|(_, value)| value.as_str()) {
+            None | Some(Some("valid")) => Ok(false),
+            Some(Some("same")) => Ok(true),
+            Some(other) => Err(format!("padding `{}` has no counterpart", other.unwrap_or("of an unknown kind"))),
+        }
+    }
+
+    /// The one axis that is normalised; -1 is the last.
+    fn axis(&self) -> Result<i64, String> {
+        let axis = match self.find(&["axis"]).map(|(_, value)| value) {
+            None => Some(-1),
+            Some(Value::Array(axes)) => axes.first().filter(|_| axes.len() == 1).and_then(Value::as_i64),
+            Some(value) => value.as_i64(),
+        };
+        axis.ok_or_else(|| "normalising over several axes has no counterpart".to_string())
+    }
+
+    fn order(&self) -> Result<Option<AxisOrder>, String> {
+        match self.find(&["data_format", "dim_ordering"]).map(|(_, value)| value.as_str()) {
+            None | Some(Some("default")) => Ok(None),
+            Some(Some("channels_last" | "tf")) => Ok(Some(AxisOrder::ChannelsLast)),
+            Some(Some("channels_first" | "th")) => Ok(Some(AxisOrder::ChannelsFirst)),
+            Some(other) => Err(format!("order of axes `{}` is unknown", other.unwrap_or("of an unknown kind"))),
+        }
+    }
+
+    fn input(&self) -> Result<Option<Vec<usize>>, String> {
+        let Some((name, value)) = self.find(&["batch_shape", "batch_input_shape"]) else { return Ok(None) };
+        let extents = value.as_array().and_then(|extents| extents.get(1..));
+        let extents: Option<Vec<usize>> =
+            extents.and_then(|all| all.iter().map(|n| if n.is_null() { Some(0) } else { size(n) }).collect());
+        extents.map(Some).ok_or_else(|| format!("`{name}` must be a list of sizes, not {}", short(value)))
+    }
+
+    /// The layer that the option `activation` stands for.
+    fn activation(&self) -> Result<Option<LayerSpec>, String> {
+        self.find(&["activation"]).map_or(Ok(None), |(_, value)| activation(value))
+    }
+}
+
+fn activation(value: &Value) -> Result<Option<LayerSpec>, String> {
+    let name = match value {
+        Value::String(name) => name.as_str(),
+        Value::Object(object) => {
+            let class = object.get("class_name").and_then(Value::as_str).unwrap_or_default();
+            match object.get("config") {
+                // A function, by name.
+                Some(Value::String(name)) => name.as_str(),
+                Some(Value::Object(config)) => {
+                    let found = pointwise(class, &Options(config))?;
+                    return found.map(Some).ok_or_else(|| format!("activation `{class}` has no counterpart"));
+                }
+                _ => class,
+            }
+        }
+        _ => return Err(format!("activation {} has no counterpart", short(value))),
+    };
+    Ok(Some(match name {
+        "linear" => return Ok(None),
+        "relu" => LayerSpec::Relu {},
+        "elu" => LayerSpec::Elu { alpha: 1.0 },
+        "tanh" => LayerSpec::Tanh {},
+        "softsign" => LayerSpec::Softsign {},
+        "leaky_relu" => LayerSpec::LeakyRelu { slope: 0.2 },
+        _ => return Err(format!("activation `{name}` has no counterpart")),
+    }))
+}
+
+/// A whole number, also written as 3.0; no larger than any size of a network.
+fn size(value: &Value) -> Option<usize> {
+    let number = value.as_f64().filter(|number| number.fract() == 0.0 && (0.0..=1e9).contains(number))?;
+    Some(number as usize)
+}
+
+fn pair(value: &Value) -> Option<[usize; 2]> {
+    match value.as_array().map(Vec::as_slice) {
+        None => size(value).map(|both| [both, both]),
+        Some([both]) => size(both).map(|both| [both, both]),
+        Some([h, w]) => Some([size(h)?, size(w)?]),
+        Some(_) => None,
+    }
+}
+
+/// A value in a message; no longer than a line.
+fn short(value: &Value) -> String {
+    let text = value.to_string();
+    if text.chars().count() > 60 { text.chars().take(60).chain(['…']).collect() } else { text }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    fn layer(class: &str, config: Value) -> KerasLayer {
+        KerasLayer { name: "l".into(), class: class.into(), config: config.as_object().unwrap().clone() }
+    }
+
+    fn step(class: &str, config: Value) -> Step {
+        translate(&layer(class, config), None).unwrap()
+    }
+
+    fn reason(class: &str, config: Value) -> String {
+        translate(&layer(class, config), None).unwrap_err()
+    }
+
+    #[test]
+    fn old_and_new_names_mean_the_same() {
+        let old = json!({"nb_filter": 3, "nb_row": 5, "nb_col": 2, "subsample": [2, 1], "border_mode": "same",
+            "dim_ordering": "tf", "bias": false, "activation": "tanh"});
+        let new = json!({"filters": 3, "kernel_size": [5, 2], "strides": [2, 1], "padding": "same",
+            "data_format": "channels_last", "use_bias": false, "activation": {"class_name": "f", "config": "tanh"}});
+        assert_eq!(step("Convolution2D", old), step("Conv2D", new));
+        assert_eq!(step("Dense", json!({"output_dim": 4})), step("Dense", json!({"units": 4, "activation": "linear"})));
+        assert_eq!(step("Dropout", json!({"p": 0.5})), step("Dropout", json!({"rate": 0.5})));
+    }
+
+    #[test]
+    fn borders_are_read_in_every_spelling() {
+        let expected = Operation::Plain(LayerSpec::ZeroPad { rows: [1, 1], columns: [2, 2] });
+        for padding in [json!([1, 2]), json!([1, 1, 2, 2]), json!([[1, 1], [2, 2]])] {
+            assert_eq!(step("ZeroPadding2D", json!({"padding": padding})).operation, expected);
+        }
+        let expected = Operation::Plain(LayerSpec::Crop { rows: [50, 20], columns: [0, 1] });
+        assert_eq!(step("Cropping2D", json!({"cropping": [[50, 20], [0, 1]]})).operation, expected);
+        assert!(reason("Cropping2D", json!({"cropping": [[50, -20], [0, 1]]})).contains("whole numbers"));
+        assert!(reason("Cropping2D", json!({"cropping": [50, 20, 7]})).contains("whole numbers"));
+    }
+
+    #[test]
+    fn what_has_no_counterpart_says_why() {
+        for (class, config, expected) in [
+            ("TimeDistributed", json!({}), "sequences"),
+            ("LSTM", json!({"units": 3}), "sequences"),
+            ("Concatenate", json!({}), "branches"),
+            ("Sequential", json!({}), "model inside"),
+            ("Conv3D", json!({}), "one or three dimensions"),
+            ("MyLayer", json!({}), "has no counterpart"),
+            ("Dense", json!({"units": 3, "activation": "sigmoid"}), "activation `sigmoid`"),
+            ("Dense", json!({}), "has no `units`"),
+            ("Dense", json!({"units": -1}), "whole number"),
+            ("Dense", json!({"units": 1e300}), "whole number"),
+            ("Conv2D", json!({"filters": 3, "kernel_size": [3, 3], "dilation_rate": [2, 2]}), "holes"),
+            ("Conv2D", json!({"filters": 3, "kernel_size": [3, 3], "padding": "causal"}), "padding `causal`"),
+            ("Conv2D", json!({"filters": 3, "kernel_size": [3, 3, 3]}), "two whole numbers"),
+            ("BatchNormalization", json!({"mode": 2}), "mode 1 and 2"),
+            ("BatchNormalization", json!({"axis": [1, 2]}), "several axes"),
+            ("ReLU", json!({"max_value": 6.0}), "ceiling"),
+            ("Lambda", json!({"function": "resize"}), "say so with --lambda l=A,B"),
+            ("MaxPooling2D", json!({"data_format": "diagonal"}), "order of axes `diagonal`"),
+        ] {
+            assert!(reason(class, config).contains(expected), "{class}: {expected}");
+        }
+    }
+
+    #[test]
+    fn the_user_can_say_what_a_lambda_computes() {
+        let known = Some(Affine { factor: 0.5, offset: -1.0 });
+        let step = translate(&layer("Lambda", json!({"function": "normalise"})), known).unwrap();
+        assert_eq!(step.operation, Operation::Plain(LayerSpec::Scale { factor: 0.5, offset: -1.0 }));
+    }
+}

@@ -1,0 +1,107 @@
+//! Convolution, activation and pooling as one.
+
+use steersman_kernels::activation;
+use steersman_kernels::pool::{self, PoolShape};
+use steersman_kernels::{Isa, conv::Conv};
+
+use super::{Conv2d, Grads, Layer, Pair};
+
+/// An activation that never falls, so that the largest of a window stays the largest.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Rising {
+    /// [`Relu`](super::Relu).
+    Relu,
+    /// [`Elu`](super::Elu) with its alpha.
+    Elu(f32),
+}
+
+/// What [`Conv2d`], an activation and [`MaxPool`](super::MaxPool) of 4x4 windows do one after the other.
+///
+/// The pooling comes first: then the activation has 16 times fewer values to compute, and the maps of the convolution live
+/// in the cache for one image only. The positions of the largest are kept; the gradient is 0 everywhere else, and the
+/// convolution's gradients are taken from these positions alone. Parameters are those of the convolution.
+///
+/// Where the activation makes different values equal (ELU far below 0), the gradient goes to the one that was the largest
+/// before, not to the first.
+#[derive(Clone, Debug)]
+pub struct PooledConv {
+    conv: Conv2d,
+    activation: Rising,
+    pool: PoolShape,
+    isa: Isa,
+}
+
+impl PooledConv {
+    /// `conv`, then `activation`, then the maximum of 4x4 windows; `None` where the convolution has no such gradients.
+    pub fn new(conv: Conv2d, activation: Rising, isa: Isa) -> Option<PooledConv> {
+        let output = conv.output();
+        let pool = PoolShape { c: output.c, h: output.h, w: output.w, kh: 4, kw: 4, stride_h: 4, stride_w: 4 };
+        conv.kernel().has_sparse_gradients().then_some(PooledConv { conv, activation, pool, isa })
+    }
+
+    fn kernel(&self) -> &Conv {
+        self.conv.kernel()
+    }
+
+    fn output_len(&self) -> usize {
+        self.pool.c * self.pool.out_h() * self.pool.out_w()
+    }
+
+    /// How many numbers of scratch any method needs for `n` images.
+    pub fn scratch_len(&self, n: usize) -> usize {
+        let map = self.pool.c * self.pool.h * self.pool.w;
+        (map + self.output_len() + self.kernel().scratch_len()).max(n * self.output_len())
+    }
+
+    /// Evaluation: overwrites `y`.
+    pub fn infer(&self, params: &[f32], n: usize, x: &[f32], y: &mut [f32], scratch: &mut [f32]) {
+        let (weight, bias) = self.conv.split(params);
+        let (map, scratch) = scratch.split_at_mut(self.pool.c * self.pool.h * self.pool.w);
+        let (pooled, scratch) = scratch.split_at_mut(self.output_len());
+        let images = x.chunks_exact(self.conv.input().len()).zip(y.chunks_exact_mut(self.output_len()));
+        for (x, y) in images.take(n) {
+            self.kernel().forward(1, x, weight, bias, map, scratch);
+            pool::max_forward(self.isa, &self.pool, 1, map, pooled);
+            self.activate(pooled, y);
+        }
+    }
+
+    fn activate(&self, x: &[f32], y: &mut [f32]) {
+        match self.activation {
+            Rising::Relu => activation::relu_forward(self.isa, x, y),
+            Rising::Elu(alpha) => activation::elu_forward(self.isa, alpha, x, y),
+        }
+    }
+
+    /// Overwrites `y`, and `starts`, as long as `y`, with where the window of the convolution that was largest begins in a
+    /// plane of the image.
+    pub fn forward(&self, params: &[f32], n: usize, x: &[f32], y: &mut [f32], starts: &mut [u32], scratch: &mut [f32]) {
+        let (weight, bias) = self.conv.split(params);
+        let (map, scratch) = scratch.split_at_mut(self.pool.c * self.pool.h * self.pool.w);
+        let (pooled, scratch) = scratch.split_at_mut(self.output_len());
+        let input = self.conv.input();
+        let outputs = y.chunks_exact_mut(self.output_len()).zip(starts.chunks_exact_mut(self.output_len()));
+        for (x, (y, starts)) in x.chunks_exact(input.len()).zip(outputs).take(n) {
+            self.kernel().forward(1, x, weight, bias, map, scratch);
+            pool::max_forward_with_places(self.isa, &self.pool, 1, input.w, map, pooled, starts);
+            self.activate(pooled, y);
+        }
+    }
+
+    /// Gradients: overwrites `dx` where it is asked for, adds to the parameters'. `starts` are those of
+    /// [`forward`](PooledConv::forward).
+    pub fn backward(&self, params: &[f32], n: usize, pair: Pair, starts: &[u32], dx: Option<&mut [f32]>, grads: Grads) {
+        let Pair { x, y, dy } = pair;
+        let Grads { dparams, scratch } = grads;
+        let dz = &mut scratch[..n * self.output_len()];
+        match self.activation {
+            Rising::Relu => activation::relu_backward(self.isa, y, dy, dz),
+            Rising::Elu(alpha) => activation::elu_backward(self.isa, alpha, y, dy, dz),
+        }
+        let (dweight, dbias) = dparams.split_at_mut(self.conv.split(params).0.len());
+        self.kernel().sparse_backward_weight(n, x, starts, dz, dweight, dbias);
+        if let Some(dx) = dx {
+            self.kernel().sparse_backward_input(n, starts, dz, self.conv.split(params).0, dx);
+        }
+    }
+}

@@ -1,0 +1,62 @@
+//! DAgger (Ross, Gordon and Bagnell 2011): the model drives, the expert says at every moment what it would have done.
+
+use std::path::{Path, PathBuf};
+
+use super::training_set::{self, Take, record_takes};
+use crate::error::{Error, Result};
+use crate::pilot::Pilot;
+use crate::simulator::recorder::{drive_and_label, write_recording};
+
+/// Shortest takes of the training set teach as much when the model drives them, and cost less.
+const LAPS: f64 = 0.5;
+
+/// What is driven in `round` (from 1): the plain takes of the training set, shorter, with other starts and light.
+pub fn takes(round: u32) -> Vec<Take> {
+    let plain = training_set::takes().into_iter().filter(|take| !take.recovery);
+    plain.map(|take| Take { laps: LAPS * take.laps, seed: take.seed + 1000 * u64::from(round), ..take }).collect()
+}
+
+/// Share of the seconds in which the expert itself is at the wheel in `round`: 1/2, 1/4, …; the model's own errors come in
+/// by and by.
+fn expert_share(round: u32) -> f64 {
+    0.5f64.powi(round.min(60) as i32)
+}
+
+/// The recordings of `round` in the folder `out`, driven by `pilot`, labelled by the expert; recorded first if `out` is not
+/// there yet.
+///
+/// # Errors
+///
+/// As [`training_set::recordings`].
+pub fn recordings(
+    pilot: &Pilot,
+    out: &Path,
+    round: u32,
+    progress: &(dyn Fn(f64) -> bool + Sync),
+) -> Result<Vec<PathBuf>> {
+    let takes = takes(round);
+    if !out.exists() {
+        let parent = out.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        let unfinished =
+            tempfile::Builder::new().prefix("unfinished-").tempdir_in(parent).map_err(Error::io(parent))?;
+        record_takes(&takes, unfinished.path(), progress, |track, take, folder, progress| {
+            let options = take.options();
+            let samples = drive_and_label(track, &options, &mut pilot.clone(), expert_share(round))?;
+            write_recording(track, &options, &samples, folder, progress).map(drop)
+        })?;
+        std::fs::rename(unfinished.keep(), out).map_err(Error::io(out))?;
+    }
+    Ok(takes.iter().map(|take| out.join(take.folder())).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_round_drives_other_takes_and_leans_less_on_the_expert() {
+        let (first, second) = (takes(1), takes(2));
+        assert!(first.iter().zip(&second).all(|(a, b)| a.seed != b.seed && a.track == b.track && !a.recovery));
+        assert_eq!([1, 2].map(expert_share), [0.5, 0.25]);
+    }
+}

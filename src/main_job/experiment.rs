@@ -1,0 +1,206 @@
+//! The two experiments of the write-ups, closed-loop: what a number promises beside what the road delivers.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
+
+use serde::Serialize;
+
+use super::job::{Stages, test_on_tracks};
+use super::{TrackResult, training_set};
+use crate::atomic_file;
+use crate::dataset::colour::Colour;
+use crate::dataset::split::SplitMode;
+use crate::error::{Error, Result};
+use crate::pilot::Pilot;
+use crate::recipe::Recipe;
+use crate::simulator::DriveOptions;
+use crate::training::{self, Observer, TrainRequest};
+
+/// What is varied.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Subject {
+    /// How validation rows are chosen: by blocks of time, single rows, single images.
+    Split,
+    /// The colours that the network sees: RGB, YUV, HSV, the saturation alone, grey.
+    Colour,
+}
+
+impl Subject {
+    /// The recipes to compare, each with its name, made from `base`.
+    fn variants(self, base: &Recipe) -> Vec<(&'static str, Recipe)> {
+        match self {
+            Subject::Split => [SplitMode::Blocks, SplitMode::Random, SplitMode::RandomImages]
+                .map(|mode| {
+                    let mut recipe = base.clone();
+                    recipe.split.mode = mode;
+                    (mode.name(), recipe)
+                })
+                .to_vec(),
+            Subject::Colour => [
+                ("rgb", Colour::Rgb),
+                ("yuv", Colour::Yuv),
+                ("hsv", Colour::Hsv),
+                ("saturation", Colour::Saturation),
+                ("gray", Colour::Gray),
+            ]
+            .map(|(name, colour)| {
+                let mut recipe = base.clone();
+                recipe.preprocessing.colour = colour;
+                (name, recipe)
+            })
+            .to_vec(),
+        }
+    }
+}
+
+/// An experiment.
+#[derive(Clone, Debug)]
+pub struct Plan {
+    /// What is varied.
+    pub subject: Subject,
+    /// What stays the same.
+    pub recipe: Recipe,
+    /// Each variant is trained with the seeds 1, 2, … up to this one.
+    pub seeds: u64,
+    /// Recordings that are trained on.
+    pub recordings: Vec<PathBuf>,
+    /// Tracks that are driven.
+    pub tracks: Vec<String>,
+    /// Runs on each track, of one lap.
+    pub runs: usize,
+    /// Memory for decoded images in MiB.
+    pub cache_mib: usize,
+}
+
+/// One training and its drives; a line of the CSV.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Trial {
+    /// What was varied: a split mode or a colour space.
+    pub variant: String,
+    /// Seed of split, weights and order.
+    pub seed: u64,
+    /// Share of the validation frames with a training frame of the same session within a second, %.
+    pub leak_percent: f64,
+    /// Promised: mean squared error of the centre camera on the validation side.
+    pub val_center_mse: Option<f64>,
+    /// Promised: mean absolute error there, in degrees of the front wheels.
+    pub val_mae_deg: Option<f64>,
+    /// Delivered: mean absolute error on fresh frames of the tracks that are driven, in degrees of the front wheels.
+    pub fresh_mae_deg: f64,
+    /// Laps completed without help, over all tracks.
+    pub laps_completed: usize,
+    /// Laps asked for.
+    pub laps_total: usize,
+    /// Mean over the tracks of the share of the time in which nobody had to help, %.
+    pub autonomy_percent: f64,
+    /// Mean over the tracks of the distance from the line, m.
+    pub cte_mean_m: f64,
+}
+
+/// Recordings of the main job's set that an experiment trains on: both training tracks, and of the random tracks as many
+/// as `random_tracks`.
+pub fn takes(random_tracks: usize) -> Vec<training_set::Take> {
+    let mut numbers = BTreeMap::new();
+    let mut takes = training_set::takes();
+    takes.retain(|take| {
+        let known = numbers.len();
+        !take.track.starts_with("random:") || *numbers.entry(take.track.clone()).or_insert(known) < random_tracks
+    });
+    takes
+}
+
+/// Trains and drives every variant of `plan` with every seed. `told` hears of each trial when it is done. Call it inside a
+/// rayon pool; runs are kept in a temporary folder only.
+///
+/// # Errors
+///
+/// As [`training::train`] and [`test_on_tracks`]; [`Error::Interrupted`] if `stop` is set.
+pub fn run(
+    plan: &Plan,
+    observer: &mut (dyn Observer + Send),
+    stages: &dyn Stages,
+    stop: &AtomicBool,
+    told: &mut (dyn FnMut(&Trial) -> Result<()> + Send),
+) -> Result<Vec<Trial>> {
+    let folder = tempfile::tempdir().map_err(Error::io(std::env::temp_dir()))?;
+    let mut trials = Vec::new();
+    for (variant, recipe) in plan.subject.variants(&plan.recipe) {
+        // Not every colour space fits every network; say so before minutes are spent.
+        recipe.network(steersman_kernels::Isa::best())?;
+        for seed in 1..=plan.seeds {
+            stages.notice(&format!("{variant}, seed {seed}"));
+            let request = TrainRequest {
+                recordings: plan.recordings.clone(),
+                recipe: recipe.clone(),
+                out: folder.path().join(format!("{variant}-{seed}")),
+                seed,
+                cache_mib: plan.cache_mib,
+            };
+            let training = training::train(request, observer, stop)?;
+            let options = DriveOptions { runs: plan.runs, ..Default::default() };
+            let pilot = Pilot::load(&training.model)?;
+            let drives = test_on_tracks(&pilot, &plan.tracks, &options, stages, stop)?;
+            let mean = |of: &dyn Fn(&TrackResult) -> f64| drives.iter().map(of).sum::<f64>() / drives.len() as f64;
+            let trial = Trial {
+                variant: variant.into(),
+                seed,
+                leak_percent: training.leak_percent,
+                val_center_mse: training.val_center_mse,
+                val_mae_deg: training.val_mae_deg,
+                fresh_mae_deg: mean(&|d| d.offline_mae_deg),
+                laps_completed: drives.iter().map(|d| d.drive.laps_completed).sum(),
+                laps_total: drives.iter().map(|d| d.drive.laps_total).sum(),
+                autonomy_percent: mean(&|d| d.drive.autonomy_percent),
+                cte_mean_m: mean(&|d| d.drive.cte_mean_m),
+            };
+            told(&trial)?;
+            trials.push(trial);
+        }
+    }
+    Ok(trials)
+}
+
+/// Writes `trials` as CSV, in whole or not at all.
+///
+/// # Errors
+///
+/// [`Error::Io`].
+pub fn write_csv(path: &Path, trials: &[Trial]) -> Result<()> {
+    let mut writer = csv::Writer::from_writer(Vec::new());
+    for trial in trials {
+        writer.serialize(trial).map_err(|e| Error::data(path, e.to_string()))?;
+    }
+    let bytes = writer.into_inner().map_err(|e| Error::data(path, e.to_string()))?;
+    atomic_file::write(path, &bytes)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn variants_differ_in_the_subject_alone_and_fit_every_shipped_network() {
+        for (name, _) in crate::recipe::SHIPPED {
+            let base = Recipe::find(name, &[]).unwrap();
+            for subject in [Subject::Split, Subject::Colour] {
+                for (variant, mut recipe) in subject.variants(&base) {
+                    recipe
+                        .network(steersman_kernels::Isa::PORTABLE)
+                        .unwrap_or_else(|e| panic!("{name} {variant}: {e}"));
+                    recipe.split.mode = base.split.mode;
+                    recipe.preprocessing.colour = base.preprocessing.colour;
+                    assert_eq!(recipe, base);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn takes_are_limited_to_some_random_tracks() {
+        let few = takes(2);
+        let random = few.iter().filter(|take| take.track.starts_with("random:")).count();
+        assert_eq!((few.len() - random, random), (8, 4));
+        assert_eq!(takes(1000), training_set::takes());
+    }
+}

@@ -1,0 +1,259 @@
+//! The main job from first to last: record the expert, train, let the model drive and learn from that (DAgger), test.
+
+use std::path::{Path, PathBuf};
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use super::{MainJobResult, TRACKS, TrackResult, dagger, test_on_track, training_set};
+use crate::atomic_file;
+use crate::error::{Error, Result};
+use crate::pilot::Pilot;
+use crate::recipe::Recipe;
+use crate::simulator::{DriveOptions, Track};
+use crate::training::{self, Observer, RunFolder, TrainRequest, TrainResult};
+
+/// Where the main job keeps what it records.
+pub const RECORDINGS: &str = "data/recordings";
+
+/// What the main job notes in a run folder, so that a run that was stopped goes on to the end of the job.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct JobNote {
+    /// Runs of the finished model on each track.
+    pub runs: usize,
+    /// Times that the model drives, the expert labels, and training begins anew on all recordings.
+    pub dagger_rounds: u32,
+    /// Rounds that lie before this run.
+    pub round: u32,
+}
+
+impl JobNote {
+    /// The note in the run folder `folder`; `None` if the run is no part of a main job.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Io`] and [`Error::Data`] for a note that cannot be read.
+    pub fn read(folder: &Path) -> Result<Option<JobNote>> {
+        let path = folder.join(RunFolder::JOB_NOTE);
+        if !path.is_file() {
+            return Ok(None);
+        }
+        let text = std::fs::read_to_string(&path).map_err(Error::io(&path))?;
+        serde_json::from_str(&text).map(Some).map_err(|e| Error::data_at(&path, e.line() as u64, e.to_string()))
+    }
+
+    fn write(&self, folder: &Path) -> Result<()> {
+        std::fs::create_dir_all(folder).map_err(Error::io(folder))?;
+        let path = folder.join(RunFolder::JOB_NOTE);
+        let text = serde_json::to_string_pretty(self).map_err(|e| Error::data(&path, e.to_string()))?;
+        atomic_file::write(&path, (text + "\n").as_bytes())
+    }
+}
+
+/// Whoever watches the parts of the job that know the share they have done.
+pub trait Stages: Sync {
+    /// A part begins; the answer is told the share that is done.
+    fn begin(&self, what: &str) -> Box<dyn Fn(f64) + Sync>;
+    /// Something the user should know.
+    fn notice(&self, text: &str);
+}
+
+/// A main job under way. Run it inside a rayon pool.
+pub struct Job<'a> {
+    note: JobNote,
+    observer: &'a mut (dyn Observer + Send),
+    stages: &'a dyn Stages,
+    stop: &'a AtomicBool,
+    folder: Option<PathBuf>,
+}
+
+/// What the first training of a job is asked for.
+#[derive(Clone, Debug)]
+pub struct JobRequest {
+    /// The experiment.
+    pub recipe: Recipe,
+    /// Run folder; must not exist or be empty. Round `k` of DAgger goes to this name with `-dagger-k`.
+    pub out: PathBuf,
+    /// Seed of all random choices.
+    pub seed: u64,
+    /// Memory for decoded images in MiB.
+    pub cache_mib: usize,
+}
+
+impl<'a> Job<'a> {
+    /// A job that ends with what `note` says.
+    pub fn new(
+        note: JobNote,
+        observer: &'a mut (dyn Observer + Send),
+        stages: &'a dyn Stages,
+        stop: &'a AtomicBool,
+    ) -> Job<'a> {
+        Job { note, observer, stages, stop, folder: None }
+    }
+
+    /// The run folder that `train --resume` takes after a stop; `None` as long as nothing was trained.
+    pub fn folder(&self) -> Option<&Path> {
+        self.folder.as_deref()
+    }
+
+    /// Does the job from the beginning.
+    ///
+    /// # Errors
+    ///
+    /// As [`training_set::recordings`], [`training::train`] and [`test_on_track`]; [`Error::Interrupted`] after a stop.
+    pub fn begin(&mut self, request: JobRequest) -> Result<MainJobResult> {
+        let JobRequest { recipe, out, seed, cache_mib } = request;
+        for round in 1..=self.note.dagger_rounds {
+            let later = dagger_folder(&out, 0, round)?;
+            if later.exists() {
+                return Err(Error::Usage(format!(
+                    "{}: exists already and is not overwritten; name another folder with --out",
+                    later.display()
+                )));
+            }
+        }
+        let recordings = training_set(&training_set::takes(), self.stages, self.stop)?;
+        let training = self.train(TrainRequest { recordings, recipe, out, seed, cache_mib })?;
+        self.rest(training)
+    }
+
+    /// Goes on with the job whose run lies in `folder`.
+    ///
+    /// # Errors
+    ///
+    /// As [`Job::begin`] and [`training::resume`].
+    pub fn go_on(&mut self, folder: &Path) -> Result<MainJobResult> {
+        self.folder = Some(folder.to_path_buf());
+        let training = training::resume(folder, self.observer, self.stop)?;
+        self.rest(training)
+    }
+
+    fn rest(&mut self, mut training: TrainResult) -> Result<MainJobResult> {
+        while self.note.round < self.note.dagger_rounds {
+            training = self.dagger_round(&training)?;
+        }
+        let drives = self.drives(&training.model)?;
+        Ok(MainJobResult { training, drives })
+    }
+
+    fn train(&mut self, request: TrainRequest) -> Result<TrainResult> {
+        RunFolder::create(&request.out)?;
+        self.note.write(&request.out)?;
+        let out = request.out.clone();
+        let result = training::train(request, self.observer, self.stop);
+        // Before `run.json` is there, nothing can be resumed.
+        self.folder = RunFolder::open(&out).is_ok().then_some(out);
+        result
+    }
+
+    /// The model drives, the expert labels; then training begins anew on all there is.
+    fn dagger_round(&mut self, training: &TrainResult) -> Result<TrainResult> {
+        let path = self.folder.clone().unwrap_or_default();
+        let round = self.note.round + 1;
+        let out = dagger_folder(&path, self.note.round, round)?;
+        let folder = RunFolder::open(&path)?;
+        let (info, recipe) = (folder.info()?, folder.recipe()?);
+        let pilot = Pilot::load(&training.model)?;
+        let recorded = {
+            let told = self.stages.begin(&format!("the model drives, the expert labels (round {round})"));
+            let progress = |share| {
+                told(share);
+                !self.stop.load(Ordering::Relaxed)
+            };
+            dagger::recordings(&pilot, &path.join("dagger"), round, &progress)?
+        };
+        let mut recordings = info.recordings;
+        recordings.extend(recorded);
+        self.note.round = round;
+        self.train(TrainRequest { recordings, recipe, out, seed: info.seed, cache_mib: info.cache_mib })
+    }
+
+    /// Drives `model` on every track of the main job, tracks in parallel.
+    fn drives(&self, model: &Path) -> Result<Vec<TrackResult>> {
+        let pilot = Pilot::load(model)?;
+        let options = DriveOptions { runs: self.note.runs, ..Default::default() };
+        test_on_tracks(&pilot, &TRACKS, &options, self.stages, self.stop)
+    }
+}
+
+/// Puts `pilot` to the test on all of `tracks` at once; the results are in their order. Call it inside a rayon pool.
+///
+/// # Errors
+///
+/// As [`test_on_track`]; [`Error::Interrupted`] if `stop` is set.
+pub fn test_on_tracks<T: AsRef<str> + Sync>(
+    pilot: &Pilot,
+    tracks: &[T],
+    options: &DriveOptions,
+    stages: &dyn Stages,
+    stop: &AtomicBool,
+) -> Result<Vec<TrackResult>> {
+    let told = stages.begin(&format!("driving on {} tracks", tracks.len()));
+    let shares = Mutex::new(vec![0.0; tracks.len()]);
+    let on_track = |(number, name): (usize, &T)| {
+        let track = Track::load(name.as_ref())?;
+        let progress = |share| {
+            let mut shares = shares.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
+            shares[number] = share;
+            told(shares.iter().sum::<f64>() / shares.len() as f64);
+            !stop.load(Ordering::Relaxed)
+        };
+        test_on_track(pilot, &track, options, &progress)
+    };
+    tracks.par_iter().enumerate().map(on_track).collect()
+}
+
+/// The recordings of `takes` under [`RECORDINGS`], recorded now if they are not there.
+///
+/// # Errors
+///
+/// As [`training_set::recordings`].
+pub fn training_set(takes: &[training_set::Take], stages: &dyn Stages, stop: &AtomicBool) -> Result<Vec<PathBuf>> {
+    let (paths, reused) = {
+        let told = stages.begin("recording the expert");
+        let progress = |share| {
+            told(share);
+            !stop.load(Ordering::Relaxed)
+        };
+        training_set::recordings(Path::new(RECORDINGS), takes, &progress)?
+    };
+    let verb = if reused { "found" } else { "recorded" };
+    stages.notice(&format!("{verb} the training set of {} recordings under {RECORDINGS}", paths.len()));
+    Ok(paths)
+}
+
+/// The run folder of DAgger's round `round`, where `folder` is that of round `from` (0: the first training).
+fn dagger_folder(folder: &Path, from: u32, round: u32) -> Result<PathBuf> {
+    let name = folder.file_name().map(|name| name.to_string_lossy().into_owned());
+    let name = name.ok_or_else(|| Error::Usage(format!("{}: a folder with a name is needed", folder.display())))?;
+    let first = name.strip_suffix(&format!("-dagger-{from}")).unwrap_or(&name);
+    Ok(folder.with_file_name(format!("{first}-dagger-{round}")))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rounds_of_dagger_are_named_after_the_first_run() {
+        let folder = |path: &str, from, round| dagger_folder(Path::new(path), from, round).unwrap();
+        assert_eq!(folder("runs/default-1", 0, 1), Path::new("runs/default-1-dagger-1"));
+        assert_eq!(folder("runs/default-1-dagger-1", 1, 2), Path::new("runs/default-1-dagger-2"));
+        assert!(dagger_folder(Path::new(".."), 0, 1).is_err());
+    }
+
+    #[test]
+    fn notes_come_back_and_a_broken_one_names_its_line() {
+        let folder = tempfile::tempdir().unwrap();
+        assert_eq!(JobNote::read(folder.path()).unwrap(), None);
+        let note = JobNote { runs: 3, dagger_rounds: 2, round: 1 };
+        note.write(folder.path()).unwrap();
+        assert_eq!(JobNote::read(folder.path()).unwrap(), Some(note));
+        std::fs::write(folder.path().join(RunFolder::JOB_NOTE), "{\n\"runs\": true}").unwrap();
+        let error = JobNote::read(folder.path()).unwrap_err().to_string();
+        assert!(error.contains("main-job.json:2"), "{error}");
+    }
+}

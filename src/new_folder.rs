@@ -1,0 +1,152 @@
+//! Folders that are there whole or not at all.
+
+use std::fs;
+use std::io::{self, ErrorKind};
+use std::path::{Path, PathBuf};
+
+use tempfile::TempDir;
+
+use crate::error::{Error, Result};
+
+/// A folder that is filled under a hidden name beside its place and gets its own name when it is whole. Dropped before, it
+/// leaves nothing behind.
+#[derive(Debug)]
+pub struct NewFolder {
+    path: PathBuf,
+    unfinished: TempDir,
+}
+
+impl NewFolder {
+    /// Prepares the folder `path`; missing parents are created.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Usage`] if there is something at `path`, or nothing can be created there.
+    pub fn create(path: &Path) -> Result<NewFolder> {
+        if fs::symlink_metadata(path).is_ok() {
+            return Err(exists(path));
+        }
+        let parent = create_parent(path)?;
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        let prefix = format!(".{name}-unfinished-");
+        let mut builder = tempfile::Builder::new();
+        builder.prefix(&prefix);
+        // Temporary folders are for their owner alone; this one is as readable as any other folder.
+        #[cfg(unix)]
+        builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o777));
+        let unfinished = builder.tempdir_in(parent).map_err(|source| denied(path, &source))?;
+        Ok(NewFolder { path: path.to_path_buf(), unfinished })
+    }
+
+    /// Where to write.
+    pub fn unfinished(&self) -> &Path {
+        self.unfinished.path()
+    }
+
+    /// Gives the folder its name.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Usage`] if something has come to be at its place, [`Error::Io`] if it cannot be renamed. What was written is
+    /// removed then.
+    pub fn finish(self) -> Result<()> {
+        if fs::symlink_metadata(&self.path).is_ok() {
+            return Err(exists(&self.path));
+        }
+        fs::rename(self.unfinished.path(), &self.path).map_err(Error::io(&self.path))?;
+        // It has moved away; there is nothing left to remove.
+        let _moved = self.unfinished.keep();
+        Ok(())
+    }
+
+    /// An error of writing to the folder, as its user should read it: with the place that was meant, and a remedy where the
+    /// disk is full.
+    pub fn explain(&self, error: Error) -> Error {
+        let Error::Io { path, source } = error else { return error };
+        let path = path.strip_prefix(self.unfinished()).map_or(path.clone(), |inside| self.path.join(inside));
+        let full = [ErrorKind::StorageFull, ErrorKind::QuotaExceeded, ErrorKind::FileTooLarge];
+        if full.contains(&source.kind()) {
+            let out = self.path.display();
+            let remedy = format!("nothing of {out} is kept; make room on that disk, or name a folder on another");
+            return Error::Usage(format!("{}: {source}; {remedy}", path.display()));
+        }
+        Error::Io { path, source }
+    }
+}
+
+/// Creates the folder `path` at once, for what is to be seen while it grows; missing parents are created.
+///
+/// # Errors
+///
+/// As [`NewFolder::create`].
+pub fn create_now(path: &Path) -> Result<()> {
+    create_parent(path)?;
+    fs::create_dir(path).map_err(|source| match source.kind() {
+        ErrorKind::AlreadyExists => exists(path),
+        _ => denied(path, &source),
+    })
+}
+
+/// Creates what is missing above `path` and returns the folder it will be in.
+fn create_parent(path: &Path) -> Result<&Path> {
+    let parent = match path.parent() {
+        Some(parent) if !parent.as_os_str().is_empty() => parent,
+        _ => Path::new("."),
+    };
+    fs::create_dir_all(parent).map_err(|source| denied(path, &source))?;
+    Ok(parent)
+}
+
+fn denied(path: &Path, source: &io::Error) -> Error {
+    let message = format!("cannot be created: {source}; name a folder where you may write");
+    Error::Usage(format!("{}: {message}", path.display()))
+}
+
+fn exists(path: &Path) -> Error {
+    let remedy = "exists already and is not overwritten; name a new folder or remove it";
+    Error::Usage(format!("{}: {remedy}", path.display()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_folder_appears_when_it_is_whole_and_leaves_nothing_behind_when_it_is_dropped() {
+        let scratch = tempfile::tempdir().unwrap();
+        let out = scratch.path().join("deep/out");
+        let folder = NewFolder::create(&out).unwrap();
+        fs::write(folder.unfinished().join("a"), "1").unwrap();
+        assert!(!out.exists());
+        folder.finish().unwrap();
+        assert_eq!(fs::read_to_string(out.join("a")).unwrap(), "1");
+
+        let other = out.with_file_name("other");
+        let dropped = NewFolder::create(&other).unwrap();
+        fs::write(dropped.unfinished().join("a"), "1").unwrap();
+        drop(dropped);
+        assert_eq!(fs::read_dir(scratch.path().join("deep")).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn what_is_there_is_never_replaced() {
+        let scratch = tempfile::tempdir().unwrap();
+        let out = scratch.path().join("out");
+        let late = NewFolder::create(&out).unwrap();
+        fs::write(&out, "mine").unwrap();
+        assert!(NewFolder::create(&out).unwrap_err().to_string().contains("exists already"));
+        assert!(late.finish().unwrap_err().to_string().contains("exists already"));
+        assert_eq!(fs::read_to_string(&out).unwrap(), "mine");
+        assert_eq!(fs::read_dir(scratch.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn a_full_disk_is_told_with_the_place_that_was_meant_and_a_remedy() {
+        let scratch = tempfile::tempdir().unwrap();
+        let folder = NewFolder::create(&scratch.path().join("out")).unwrap();
+        let source = io::Error::from(ErrorKind::StorageFull);
+        let error = Error::Io { path: folder.unfinished().join("IMG/a.jpg"), source };
+        let message = folder.explain(error).to_string();
+        assert!(message.contains("out/IMG/a.jpg: ") && message.contains("make room"), "{message}");
+    }
+}

@@ -1,0 +1,301 @@
+//! Damaged and hostile files: whatever is in them, the answer is an error or a value, never a panic, and memory stays bounded.
+//!
+//! A mutation harness without a special toolchain: valid files of every format are damaged at random, from a seed, and read.
+//! It runs for some seconds; `STEERSMAN_FUZZ_SECONDS=300 cargo test --release --test hostile_files` runs longer, and
+//! `STEERSMAN_FUZZ_SEED=…` begins elsewhere. A failure names its seed, and repeats with it.
+
+use std::io::{Cursor, Read, Write};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::{Path, PathBuf};
+use std::sync::Mutex;
+use std::time::{Duration, Instant};
+
+use cap::Cap;
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use steersman::exchange::keras::{ImportOptions, import};
+use steersman::exchange::presets;
+use steersman::model_file::{Model, TrainingRecord};
+use steersman::recipe::Recipe;
+use steersman::tensor::Shape;
+use steersman_kernels::Isa;
+
+/// Counts every allocation, and ends the process at the limit.
+#[global_allocator]
+static MEMORY: Cap<std::alloc::System> = Cap::new(std::alloc::System, 1 << 30);
+
+/// Memory that a damaged file of about 100 KB may take.
+const MAX_BYTES: usize = 64 << 20;
+
+/// One test at a time, so that memory belongs to it.
+static ALONE: Mutex<()> = Mutex::new(());
+
+fn golden(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden/keras").join(name)
+}
+
+fn number<T: std::str::FromStr>(variable: &str, default: T) -> T {
+    std::env::var(variable).ok().map_or(default, |text| text.parse().unwrap_or_else(|_| panic!("{variable}={text}")))
+}
+
+/// Damages `bytes` in one to eight places.
+fn damage(random: &mut ChaCha8Rng, bytes: &mut Vec<u8>) {
+    let mut below = |bound: usize| (random.next_u64() % bound.max(1) as u64) as usize;
+    for _ in 0..=below(8) {
+        let at = below(bytes.len());
+        let end = (at + 1 + below(16)).min(bytes.len());
+        match below(9) {
+            0 => bytes[at..end].iter_mut().for_each(|byte| *byte = 0xff),
+            1 => bytes[at..end].iter_mut().for_each(|byte| *byte = 0),
+            2 => {
+                if let Some(byte) = bytes.get_mut(at) {
+                    *byte ^= 1 << below(8);
+                }
+            }
+            3 => {
+                if let Some(byte) = bytes.get_mut(at) {
+                    *byte = below(256) as u8;
+                }
+            }
+            4 => bytes.truncate(at),
+            5 => drop(bytes.drain(at..end)),
+            // A part of the file in another place: addresses that lead elsewhere, nested brackets.
+            6 => {
+                let part = bytes[at..end].to_vec();
+                let to = below(bytes.len());
+                bytes.splice(to..to, part);
+            }
+            7 => {
+                let part = bytes[at..end].to_vec();
+                let to = below(bytes.len().saturating_sub(part.len()));
+                for (byte, new) in bytes[to..].iter_mut().zip(part) {
+                    *byte = new;
+                }
+            }
+            // Numbers at the edge, as sizes and addresses.
+            _ => {
+                let edge = [0, 1, 0x7f, 0xffff, 0x7fff_ffff, 0xffff_ffff, 1 << 40, u64::MAX >> 1, bytes.len() as u64];
+                let value = edge[below(edge.len())].to_le_bytes();
+                for (byte, new) in bytes[at..].iter_mut().zip(value) {
+                    *byte = new;
+                }
+            }
+        }
+    }
+}
+
+/// Damages a number or a word of a text, so that it often stays well-formed.
+fn damage_text(random: &mut ChaCha8Rng, bytes: &mut Vec<u8>) {
+    let below = |random: &mut ChaCha8Rng, bound: usize| (random.next_u64() % bound.max(1) as u64) as usize;
+    if below(random, 3) == 0 {
+        return damage(random, bytes);
+    }
+    for _ in 0..=below(random, 4) {
+        let digits: Vec<usize> = (0..bytes.len()).filter(|i| bytes[*i].is_ascii_digit()).collect();
+        if digits.is_empty() {
+            return;
+        }
+        let at = digits[below(random, digits.len())];
+        let words = [
+            "0",
+            "-1",
+            "1e999",
+            "99999999999",
+            "4294967296",
+            "null",
+            "\"x\"",
+            "[]",
+            "{}",
+            "[[1,2],3]",
+            "0.5",
+            "true",
+            "65536",
+        ];
+        let word = words[below(random, words.len())].bytes();
+        bytes.splice(at..at + 1, word);
+    }
+}
+
+/// Reads damaged versions of `original` for `share` of the time, and reports what happened.
+fn hammer(
+    name: &str,
+    original: &[u8],
+    share: f64,
+    damage: impl Fn(&mut ChaCha8Rng, &mut Vec<u8>),
+    read: impl Fn(&[u8]) -> Result<(), String>,
+) {
+    let seconds = number("STEERSMAN_FUZZ_SECONDS", 4.0);
+    let end = Instant::now() + Duration::from_secs_f64(seconds * share);
+    let first = number("STEERSMAN_FUZZ_SEED", 1u64);
+    let (mut accepted, mut refused, mut most, mut slowest) = (0, 0, 0, Duration::ZERO);
+    read(original).unwrap_or_else(|e| panic!("{name}: the undamaged file is refused: {e}"));
+    for seed in first.. {
+        // A hundred at least, however slow the machine is.
+        if Instant::now() > end && seed >= first + 100 {
+            break;
+        }
+        let mut bytes = original.to_vec();
+        damage(&mut ChaCha8Rng::seed_from_u64(seed), &mut bytes);
+        let (before, started) = (MEMORY.allocated(), Instant::now());
+        MEMORY.set_limit(before + MAX_BYTES).expect("the limit is above what is in use");
+        let result = catch_unwind(AssertUnwindSafe(|| read(&bytes)));
+        MEMORY.set_limit(1 << 30).expect("the limit is above what is in use");
+        match result {
+            Ok(Ok(())) => accepted += 1,
+            Ok(Err(message)) => {
+                assert!(!message.is_empty() && message.len() < 100_000, "{name}, seed {seed}: {} bytes", message.len());
+                refused += 1;
+            }
+            Err(_) => panic!("{name}: panic with seed {seed}"),
+        }
+        most = most.max(bytes.len());
+        slowest = slowest.max(started.elapsed());
+    }
+    println!("{name}: {accepted} accepted, {refused} refused, slowest {slowest:.1?}, files up to {most} bytes");
+    assert!(refused > 0, "{name}: damage that is never noticed is no damage");
+}
+
+/// Writes `bytes` where a command would find them.
+fn stored(folder: &Path, bytes: &[u8]) -> PathBuf {
+    let path = folder.join("file");
+    std::fs::write(&path, bytes).unwrap();
+    path
+}
+
+fn import_bytes(folder: &Path, bytes: &[u8], options: &ImportOptions) -> Result<(), String> {
+    let imported = import(&stored(folder, bytes), options).map_err(|e| e.to_string())?;
+    let preprocessing = toml::from_str(&format!("resize = [{}, {}]", imported.input.h, imported.input.w));
+    let preprocessing = preprocessing.map_err(|e| e.to_string())?;
+    imported.into_model("damaged", preprocessing).map(|_| ()).map_err(|e| e.to_string())
+}
+
+/// The entries of a `.keras` archive.
+fn entries(name: &str) -> Vec<(String, Vec<u8>)> {
+    let mut archive = zip::ZipArchive::new(std::fs::File::open(golden(name)).unwrap()).unwrap();
+    let read = |i: usize| {
+        let mut entry = archive.by_index(i).unwrap();
+        let mut bytes = Vec::new();
+        entry.read_to_end(&mut bytes).unwrap();
+        (entry.name().unwrap().to_string(), bytes)
+    };
+    (0..3).map(read).collect()
+}
+
+fn archive(entries: &[(String, Vec<u8>)]) -> Vec<u8> {
+    let mut writer = zip::ZipWriter::new(Cursor::new(Vec::new()));
+    for (name, bytes) in entries {
+        let options = zip::write::SimpleFileOptions::default().compression_method(zip::CompressionMethod::Deflated);
+        writer.start_file(name.as_str(), options).unwrap();
+        writer.write_all(bytes).unwrap();
+    }
+    writer.finish().unwrap().into_inner()
+}
+
+#[test]
+fn damaged_keras_files_are_refused() {
+    let _alone = ALONE.lock();
+    let folder = tempfile::tempdir().unwrap();
+    let options = ImportOptions::default();
+    for name in ["keras1.h5", "keras2.h5", "keras3.h5"] {
+        let bytes = std::fs::read(golden(name)).unwrap();
+        hammer(name, &bytes, 0.15, damage, |bytes| import_bytes(folder.path(), bytes, &options));
+    }
+    let bytes = std::fs::read(golden("keras3.keras")).unwrap();
+    hammer("keras3.keras", &bytes, 0.05, damage, |bytes| import_bytes(folder.path(), bytes, &options));
+
+    let theano = ImportOptions { input: Some(Shape::new(3, 20, 28)), ..ImportOptions::default() };
+    let json = std::fs::read(golden("keras1-theano.json")).unwrap();
+    let weights = golden("keras1-theano-weights.h5");
+    let path = folder.path().join("architecture.json");
+    hammer("an architecture in a string", &json, 0.05, damage_text, |bytes| {
+        std::fs::write(&path, bytes).unwrap();
+        let options = ImportOptions { architecture: Some(path.clone()), ..theano.clone() };
+        import(&weights, &options).map(|_| ()).map_err(|e| e.to_string())
+    });
+    // Damage within an intact archive.
+    let original = entries("keras3.keras");
+    for (place, (name, bytes)) in original.iter().enumerate().filter(|(_, (name, _))| name != "metadata.json") {
+        let damage = if name.ends_with("json") { damage_text } else { damage };
+        hammer(&format!("{name} in keras3.keras"), bytes, 0.15, damage, |bytes| {
+            let mut entries = original.clone();
+            entries[place].1 = bytes.to_vec();
+            import_bytes(folder.path(), &archive(&entries), &options)
+        });
+    }
+}
+
+#[test]
+fn damaged_files_of_our_own_are_refused() {
+    let _alone = ALONE.lock();
+    let folder = tempfile::tempdir().unwrap();
+    let recipe = Recipe::find("lenet", &["layers=[{kind='conv2d', filters=2, kernel=[9, 9], stride=[4, 4]}, {kind='batch_norm'}, \
+        {kind='prelu'}, {kind='leaky_relu', slope=0.1}, {kind='zero_pad', rows=[1, 1]}, {kind='max_pool', window=[4, 4]}, \
+        {kind='dense', units=1}]".to_string()])
+    .unwrap();
+    let parameters = recipe.network(Isa::PORTABLE).unwrap().initialize(1);
+    let path = folder.path().join("model.safetensors");
+    let model = Model { recipe, parameters, record: TrainingRecord::default(), training_rows: vec![1, 2, 3] };
+    model.save(&path).unwrap();
+    let bytes = std::fs::read(&path).unwrap();
+    let load = |bytes: &[u8]| Model::load(&stored(folder.path(), bytes)).map(|_| ()).map_err(|e| e.to_string());
+    hammer("a model file", &bytes, 0.1, damage, load);
+    hammer(
+        "a model file's header",
+        &bytes,
+        0.1,
+        |random, bytes| {
+            let tensors = bytes.split_off(8 + u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize);
+            let mut header = bytes.split_off(8);
+            damage_text(random, &mut header);
+            *bytes = [&(header.len() as u64).to_le_bytes()[..], &header, &tensors].concat();
+        },
+        load,
+    );
+
+    let text = model.recipe.to_toml().unwrap();
+    hammer("a recipe", text.as_bytes(), 0.1, damage_text, |bytes| {
+        let text = std::str::from_utf8(bytes).map_err(|e| e.to_string())?;
+        Recipe::parse("damaged", text, &[]).map(|_| ()).map_err(|e| e.to_string())
+    });
+    let toml = folder.path().join("p.toml");
+    let name = toml.to_str().unwrap().to_string();
+    let table = "source = [160, 320]\nrows = [40, 138]\nresize = [64, 64]\ninterpolation = 'area'\ncolour = 'hsv'\nscale = 0.5\n";
+    hammer("a preprocessing", table.as_bytes(), 0.05, damage_text, |bytes| {
+        std::fs::write(&toml, bytes).unwrap();
+        presets::find(&name).map(|_| ()).map_err(|e| e.to_string())
+    });
+}
+
+#[test]
+fn valid_files_that_mean_harm_are_refused() {
+    let _alone = ALONE.lock();
+    let folder = tempfile::tempdir().unwrap();
+    let refused = |bytes: &[u8]| {
+        let before = MEMORY.allocated();
+        MEMORY.set_limit(before + MAX_BYTES).unwrap();
+        let message = import_bytes(folder.path(), bytes, &ImportOptions::default()).unwrap_err();
+        MEMORY.set_limit(1 << 30).unwrap();
+        message
+    };
+    let file = |name: &str| std::fs::read(golden(name)).unwrap();
+    // A group that contains itself, tensors larger than the file, tensors in another file.
+    assert!(refused(&file("hostile-cycle.h5")).contains("kernel"));
+    assert!(refused(&file("hostile-huge.h5")).contains("kernel"));
+    assert!(refused(&file("hostile-elsewhere.h5")).contains("kernel"));
+
+    // An archive of kilobytes that unpacks to hundreds of megabytes.
+    let mut entries = entries("keras3.keras");
+    let place = entries.iter().position(|(name, _)| name == "config.json").unwrap();
+    let config = std::mem::replace(&mut entries[place].1, vec![b' '; 300 << 20]);
+    let bomb = archive(&entries);
+    entries[place].1 = Vec::new();
+    assert!(bomb.len() < 1 << 20);
+    let message = refused(&bomb);
+    assert!(message.contains("unpacks to more than"), "{message}");
+    // Brackets without end.
+    entries[place].1 = [&config[..config.len() / 2], &b"[".repeat(1 << 20)].concat();
+    assert!(refused(&archive(&entries)).contains("no JSON"));
+    // The same archive twice over, and an archive of nothing.
+    assert!(!refused(&archive(&[])).is_empty());
+    assert!(!refused(&archive(&entries[..1])).is_empty());
+}

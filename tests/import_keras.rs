@@ -1,0 +1,210 @@
+//! Keras files of every generation give the outputs that Keras gave (see `tests/golden/README.md`), real ones steer, and what
+//! cannot be imported is refused in full.
+
+mod common;
+
+use std::path::{Path, PathBuf};
+
+use common::command::{error, json, run};
+use common::formula::{hash, unit};
+use common::painted_log;
+use ndarray::{Array4, ArrayView4};
+use serde_json::Value;
+use steersman::exchange::keras::{ImportOptions, import};
+use steersman::network::Network;
+use steersman::tensor::Shape;
+use steersman_kernels::Isa;
+
+fn golden(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden/keras").join(name)
+}
+
+fn expected() -> Value {
+    serde_json::from_str(&std::fs::read_to_string(golden("expected.json")).unwrap()).unwrap()
+}
+
+/// Grey levels from the formula.
+fn images(n: usize, Shape { c, h, w }: Shape) -> Array4<f32> {
+    let hash = hash("input");
+    let grey = (0..n * c * h * w).map(|i| ((unit(hash(i)) + 1.0) * 127.5 + 0.5).floor() as f32);
+    Array4::from_shape_vec((n, c, h, w), grey.collect()).unwrap()
+}
+
+/// Imports `file` and compares its outputs with those of `model` in Keras, on every vector unit.
+fn agrees(file: &str, model: &str, options: &ImportOptions) {
+    let expected = expected();
+    let outputs: Vec<f64> = serde_json::from_value(expected[model]["outputs"].clone()).unwrap();
+    let imported = import(&golden(file), options).unwrap_or_else(|e| panic!("{file}: {e}"));
+    let input: Vec<usize> = serde_json::from_value(expected[model]["input"].clone()).unwrap();
+    assert_eq!(imported.input, Shape::new(input[2], input[0], input[1]), "{file}");
+    let images = images(outputs.len(), imported.input);
+    for isa in Isa::available() {
+        let network = Network::new(imported.input, &imported.layers, isa).unwrap();
+        let view: ArrayView4<f32> = images.view();
+        let found = network.predict(&imported.parameters, view).unwrap();
+        for (found, expected) in found.iter().zip(&outputs) {
+            assert!((f64::from(*found) - expected).abs() <= 1e-5, "{file}, {}: {found} for {expected}", isa.name());
+        }
+    }
+}
+
+#[test]
+fn files_of_todays_keras_agree_with_it() {
+    for (file, model) in [
+        ("keras3.keras", "keras3"),
+        ("keras3.h5", "keras3"),
+        ("functional.keras", "functional"),
+        ("functional.h5", "functional"),
+    ] {
+        agrees(file, model, &ImportOptions::default());
+    }
+}
+
+#[test]
+fn files_in_the_style_of_keras_1_and_2_agree_with_it() {
+    agrees("keras1.h5", "plain", &ImportOptions::default());
+    agrees("keras2.h5", "plain", &ImportOptions::default());
+    // Theano's axes and kernels, weights alone, the architecture in a string and without the input's size.
+    let options = ImportOptions {
+        architecture: Some(golden("keras1-theano.json")),
+        theano_kernels: true,
+        input: Some(Shape::new(3, 20, 28)),
+        ..ImportOptions::default()
+    };
+    agrees("keras1-theano-weights.h5", "plain", &options);
+    let unturned = ImportOptions { theano_kernels: false, ..options };
+    let notices = import(&golden("keras1-theano-weights.h5"), &unturned).unwrap().notices;
+    assert!(notices[0].contains("--theano-kernels"), "{notices:?}");
+}
+
+#[test]
+fn every_layer_is_reported_with_what_becomes_of_it() {
+    let imported = import(&golden("functional.keras"), &ImportOptions::default()).unwrap();
+    let row = |name: &str| {
+        let found = imported.report.iter().find(|row| row.layer == name).unwrap();
+        (found.class.clone(), found.becomes.join(" "))
+    };
+    assert_eq!(row("eyes"), ("Conv2D".into(), "conv1".into()));
+    assert_eq!(row("dense_5"), ("Dense".into(), "conv2 relu1".into()));
+    assert_eq!(row("gaussian_noise"), ("GaussianNoise".into(), String::new()));
+    assert_eq!(row("steering"), ("Dense".into(), "dense2".into()));
+    assert!(imported.notices[0].contains("acts in training only"));
+}
+
+#[test]
+fn an_imported_model_is_like_any_other() {
+    let folder = tempfile::tempdir().unwrap();
+    let log = painted_log::write(&folder.path().join("log"), 30, "");
+    let log = log.parent().unwrap().to_str().unwrap().to_string();
+    let answer = json(
+        folder.path(),
+        &["import", golden("keras2.h5").to_str().unwrap(), "--out", "m.safetensors", "--fit", &log, "--json"],
+    );
+    assert_eq!(answer["keras_version"], "2.1.2");
+    assert_eq!(answer["parameters"], 2450);
+    let fits = answer["fit"].as_array().unwrap();
+    let correlation = |fit: &Value| fit["correlation"].as_f64().unwrap();
+    assert!(fits.len() >= 12 && correlation(&fits[0]) >= correlation(&fits[1]));
+    assert_eq!(answer["preprocessing"], fits[0]["preprocessing"]);
+
+    let metrics = json(folder.path(), &["evaluate", "m.safetensors", &log, "--json"]);
+    assert_eq!(metrics["rows"], 30);
+    assert!((metrics["correlation"].as_f64().unwrap() - correlation(&fits[0])).abs() < 1e-6);
+    let summary = String::from_utf8(run(folder.path(), &["summary", "m.safetensors"]).stdout).unwrap();
+    assert!(summary.contains("leaky ReLU 0.2") && summary.contains("zero padding"), "{summary}");
+    assert!(summary.contains("not trained here"), "{summary}");
+    let frame = std::fs::read_dir(Path::new(&log).join("IMG")).unwrap().next().unwrap().unwrap().path();
+    run(folder.path(), &["predict", "m.safetensors", frame.to_str().unwrap()]);
+
+    let again = error(folder.path(), &["import", golden("keras2.h5").to_str().unwrap(), "--out", "m.safetensors"]);
+    assert!(again.contains("m.safetensors exists"), "{again}");
+}
+
+#[test]
+fn what_cannot_be_imported_is_said_in_full() {
+    let folder = tempfile::tempdir().unwrap();
+    let keras1 = golden("keras1.h5");
+    let import = |args: &[&str]| error(folder.path(), &[&["import", "--out", "m.safetensors"], args].concat());
+    let weights = golden("keras1-theano-weights.h5");
+    let weights = weights.to_str().unwrap();
+
+    assert!(import(&["none.h5"]).contains("none.h5"));
+    assert!(import(&[weights]).contains("--architecture FILE.json"));
+    assert!(import(&[golden("expected.json").to_str().unwrap()]).contains("neither an HDF5 file nor the zip archive"));
+    let architecture = golden("keras1-theano.json");
+    let unsized_input = import(&[weights, "--architecture", architecture.to_str().unwrap()]);
+    assert!(unsized_input.contains("give the preprocessing"), "{unsized_input}");
+    let unfitting = import(&[keras1.to_str().unwrap(), "--preprocessing", "oargueta"]);
+    assert!(unfitting.contains("takes images of 20x28 with 3 colour planes"), "{unfitting}");
+    let unknown = import(&[keras1.to_str().unwrap(), "--lambda", "lambda_7=2,1"]);
+    assert!(unknown.contains("has no layer `lambda_7`"), "{unknown}");
+
+    let json = r#"{"class_name": "Sequential", "config": [
+        {"class_name": "TimeDistributed", "config": {"name": "frames", "batch_input_shape": [null, 5, 20, 28, 3]}},
+        {"class_name": "Conv2D", "config": {"name": "eyes", "filters": 3, "kernel_size": [3, 3], "dilation_rate": [2, 2]}},
+        {"class_name": "Flatten", "config": {"name": "flat"}},
+        {"class_name": "LSTM", "config": {"name": "memory", "units": 3}},
+        {"class_name": "Dense", "config": {"name": "out", "units": 1, "activation": "sigmoid"}}]}"#;
+    std::fs::write(folder.path().join("lstm.json"), json).unwrap();
+    let all = import(&[weights, "--architecture", "lstm.json"]);
+    assert!(all.contains("4 layers cannot be imported"), "{all}");
+    for layer in ["frames (TimeDistributed)", "eyes (Conv2D)", "memory (LSTM)", "out (Dense): activation `sigmoid`"] {
+        assert!(all.contains(layer), "{layer} in {all}");
+    }
+
+    let other = std::fs::read_to_string(architecture).unwrap().replace("nb_filter\\\": 5", "nb_filter\\\": 6");
+    std::fs::write(folder.path().join("other.json"), other).unwrap();
+    std::fs::write(folder.path().join("p.toml"), "resize = [20, 28]").unwrap();
+    let wrong = import(&[weights, "--architecture", "other.json", "--preprocessing", "p.toml"]);
+    assert!(wrong.contains("conv_b (Convolution2D): tensor `conv_b_W:0` has shape"), "{wrong}");
+    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 3, "nothing is left behind");
+}
+
+/// The folder in `variable`, or a printed reason.
+fn folder_of(variable: &str) -> Option<PathBuf> {
+    let folder = std::env::var_os(variable).map(PathBuf::from);
+    match folder.as_ref().map(|folder| folder.is_dir()) {
+        Some(true) => folder,
+        Some(false) => panic!("{variable} is no folder: {folder:?}"),
+        None => {
+            eprintln!("skipped: {variable} is not set");
+            None
+        }
+    }
+}
+
+/// Two models of 2017 (naokishibuya/car-behavioral-cloning) whose correlations with the labels are known.
+#[test]
+fn real_models_of_2017_steer() {
+    let (Some(models), Some(recordings)) = (folder_of("STEERSMAN_MODELS"), folder_of("STEERSMAN_RECORDINGS")) else {
+        return;
+    };
+    let folder = tempfile::tempdir().unwrap();
+    let correlation = |model: &str, recording: &str| {
+        let recording = recordings.join(recording);
+        let metrics = json(folder.path(), &["evaluate", model, recording.to_str().unwrap(), "--json"]);
+        metrics["correlation"].as_f64().unwrap()
+    };
+    let first = models.join("naokishibuya/model.h5");
+    let args = ["--preprocessing", "naokishibuya", "--out", "first.safetensors", "--json"];
+    let answer = json(folder.path(), &[&["import", first.to_str().unwrap()][..], &args].concat());
+    assert_eq!((answer["parameters"].as_u64(), answer["keras_version"].as_str()), (Some(252_219), Some("1.2.1")));
+    let (lake, mountain) =
+        (correlation("first.safetensors", "lake-sample"), correlation("first.safetensors", "mountain-keyboard"));
+    println!("correlation with the labels: {lake:.3} on the lake, {mountain:.3} on the mountain");
+
+    let second = models.join("naokishibuya-2017-01-14");
+    let (file, architecture) = (second.join("model.h5"), second.join("model.json"));
+    let args = ["--preprocessing", "naokishibuya-2017-01-14", "--out", "second.safetensors"];
+    let files = ["import", file.to_str().unwrap(), "--architecture", architecture.to_str().unwrap()];
+    run(folder.path(), &[&files[..], &args].concat());
+    let (earlier_lake, earlier_mountain) =
+        (correlation("second.safetensors", "lake-sample"), correlation("second.safetensors", "mountain-keyboard"));
+    println!(
+        "correlation with the labels, earlier model: {earlier_lake:.3} on the lake, {earlier_mountain:.3} on the mountain"
+    );
+    // Keras itself, on every third row and with another resizing: 0.66, 0.32; 0.48, 0.62.
+    for (found, expected) in [(lake, 0.66), (mountain, 0.34), (earlier_lake, 0.48), (earlier_mountain, 0.63)] {
+        assert!((found - expected).abs() < 0.02, "{found} for {expected}");
+    }
+}
