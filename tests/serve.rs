@@ -259,9 +259,9 @@ fn bad_telemetry_is_answered_so_that_the_car_does_not_wait_for_ever() {
         served.wait_until_it_says(words);
         client.send(&good);
         // On a slow machine the throttle is cut once more in between.
-        let again =
+        let mut again =
             (0..10).map(|_| client.next()).filter(|text| text.starts_with("42[\"steer\"")).map(|text| command(&text));
-        let last = again.into_iter().find(|(_, throttle)| *throttle > 0.0);
+        let last = again.find(|(_, throttle)| *throttle > 0.0);
         assert_eq!(last.map(|(steering, _)| steering), Some(steering), "{words}");
     }
     served.stop();

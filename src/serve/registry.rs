@@ -83,7 +83,12 @@ impl Registry {
                 peers = self.left.wait_timeout(peers, left).unwrap_or_else(PoisonError::into_inner).0;
             }
         }
-        let peer = Arc::new(Peer { id, stream: stream.clone(), stage: AtomicU8::new(Stage::Opening as u8), closing: AtomicBool::new(false) });
+        let peer = Arc::new(Peer {
+            id,
+            stream: stream.clone(),
+            stage: AtomicU8::new(Stage::Opening as u8),
+            closing: AtomicBool::new(false),
+        });
         peers.push(peer.clone());
         (Some(peer), full)
     }
