@@ -102,7 +102,7 @@ const KINDS: [Kind; 8] = [
     }),
     ("frames that are too large", |port, turn| {
         let mut attack = Attack::open(port)?;
-        if turn % 2 == 0 {
+        if turn.is_multiple_of(2) {
             attack.say(b"\x81\xff\x00\x00\x00\xff\xff\xff\xff\xff\0\0\0\0")?;
             attack.say(&[b'4'; 65_536])?;
         } else {
@@ -156,9 +156,11 @@ const KINDS: [Kind; 8] = [
                 huge[at + 5..at + 9].fill(0xff);
                 huge
             }
-            2 => {
-                good.iter().enumerate().map(|(at, byte)| if at > 700 && at % 7 == 0 { !byte } else { *byte }).collect()
-            }
+            2 => good
+                .iter()
+                .enumerate()
+                .map(|(at, byte)| if at > 700 && at.is_multiple_of(7) { !byte } else { *byte })
+                .collect(),
             3 => {
                 let mut plain = Vec::new();
                 let encoder = jpeg_encoder::Encoder::new(&mut plain, 60);
@@ -174,8 +176,8 @@ const KINDS: [Kind; 8] = [
         Some(())
     }),
     ("slow requests and slow frames", |port, turn| {
-        let mut attack = if turn % 2 == 0 { Attack::begin(port)? } else { Attack::open(port)? };
-        let bytes = if turn % 2 == 0 { REQUEST } else { b"\x81\xfe\x10\x00\0\0\0\042[\"telemetry\"" };
+        let mut attack = if turn.is_multiple_of(2) { Attack::begin(port)? } else { Attack::open(port)? };
+        let bytes = if turn.is_multiple_of(2) { REQUEST } else { b"\x81\xfe\x10\x00\0\0\0\042[\"telemetry\"" };
         for byte in bytes.iter().take(20) {
             attack.say(&[*byte])?;
             std::thread::sleep(Duration::from_millis(50));
