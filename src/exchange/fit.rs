@@ -179,7 +179,8 @@ pub fn rank(
     };
     let mut finalists: Vec<Preprocessing> =
         judge(combinations, FRAMES[0])?.into_iter().take(FINALISTS).map(|candidate| candidate.preprocessing).collect();
-    for best in finalists[..finalists.len().min(2)].to_vec() {
+    let best_two: Vec<Preprocessing> = finalists.iter().take(2).cloned().collect();
+    for best in best_two {
         finalists.push(Preprocessing { interpolation: Interpolation::Area, ..best.clone() });
         if !matches!(best.colour, Colour::Rgb | Colour::Bgr) {
             finalists.push(Preprocessing { interpolation: Interpolation::Area, colour_first: true, ..best });

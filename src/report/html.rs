@@ -160,6 +160,23 @@ fn looks_like_a_number(text: &str) -> bool {
 }
 
 #[cfg(test)]
+/// Checks that `text` is well-formed and that nothing in it makes a browser load something.
+pub(super) fn assert_stands_alone(text: &str) {
+    let options = roxmltree::ParsingOptions { allow_dtd: true, ..Default::default() };
+    let document = roxmltree::Document::parse_with_options(text, options).unwrap();
+    for node in document.descendants() {
+        let name = node.tag_name().name();
+        assert!(!["script", "link", "iframe", "object", "embed"].contains(&name), "<{name}>");
+        for attribute in node.attributes() {
+            if ["src", "href", "srcset"].contains(&attribute.name()) {
+                assert!(attribute.value().starts_with("data:"), "{name} loads {}", attribute.value());
+            }
+        }
+    }
+    assert!(!text.contains("url(") && !text.contains("@import"));
+}
+
+#[cfg(test)]
 mod tests {
     use super::*;
 
@@ -179,23 +196,4 @@ mod tests {
         );
         assert!(text.contains("x<br/>&quot;y&quot;"));
     }
-
-    /// Checks that `text` is well-formed and that nothing in it makes a browser load something.
-    pub(crate) fn assert_stands_alone(text: &str) {
-        let options = roxmltree::ParsingOptions { allow_dtd: true, ..Default::default() };
-        let document = roxmltree::Document::parse_with_options(text, options).unwrap();
-        for node in document.descendants() {
-            let name = node.tag_name().name();
-            assert!(!["script", "link", "iframe", "object", "embed"].contains(&name), "<{name}>");
-            for attribute in node.attributes() {
-                if ["src", "href", "srcset"].contains(&attribute.name()) {
-                    assert!(attribute.value().starts_with("data:"), "{name} loads {}", attribute.value());
-                }
-            }
-        }
-        assert!(!text.contains("url(") && !text.contains("@import"));
-    }
 }
-
-#[cfg(test)]
-pub(crate) use tests::assert_stands_alone;

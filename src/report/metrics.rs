@@ -130,8 +130,8 @@ mod tests {
         assert_relative_eq!(m.r2.unwrap(), 1.0 - 0.02 / variance, max_relative = 1e-6);
         // Deviations from the means 0.055 and 0.005.
         let products = (-0.255 * -0.405) + (-0.035 * 0.015) + (0.345 * 0.395) + (0.145 * -0.005);
-        let (a, b) = (0.065025 + 0.001225 + 0.119025 + 0.021025, 0.164025 + 0.000225 + 0.156025 + 0.000025);
-        assert_relative_eq!(m.correlation.unwrap(), products / (a * b as f64).sqrt(), max_relative = 1e-6);
+        let (a, b): (f64, f64) = (0.065025 + 0.001225 + 0.119025 + 0.021025, 0.164025 + 0.000225 + 0.156025 + 0.000025);
+        assert_relative_eq!(m.correlation.unwrap(), products / (a * b).sqrt(), max_relative = 1e-6);
         // 5.5° and 9.5° within 0.1 s each; the last row is another session.
         assert_relative_eq!(
             m.whiteness_deg_s.unwrap(),

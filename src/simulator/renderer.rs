@@ -351,9 +351,7 @@ impl View<'_> {
         Air { clear: 256 - share, red_blue: (haze & RED_BLUE) * share, green: (haze >> 8 & 255) * share }
     }
 
-    /// Colours eight pixels between two marched columns. A function of its own, like the ones below: inlined into one large
-    /// one their loops run out of registers.
-    #[inline(never)]
+    /// Colours eight pixels between two marched columns.
     fn shade_span(
         &self,
         a: &Spot,
@@ -421,7 +419,7 @@ impl View<'_> {
             light = u32::from(self.variant.road_light[(land >> 24) as usize]);
         }
         // The land's colours are lit already.
-        let (road, land_share) = (alpha * light >> 8, 256 - alpha);
+        let (road, land_share) = ((alpha * light) >> 8, 256 - alpha);
         let red_blue = ((texel & RED_BLUE) * road + (land & RED_BLUE) * land_share) >> 8 & RED_BLUE;
         let green = ((texel >> 8 & 255) * road + (land >> 8 & 255) * land_share) >> 8;
         self.finish(red_blue | green << 8, FULL, &levels.air, out);
@@ -431,7 +429,7 @@ impl View<'_> {
     /// blue are computed in one word, green in another.
     #[inline(always)]
     pub(super) fn finish(&self, colour: u32, light: u32, air: &Air, out: &mut [u8; 3]) {
-        let share = light * air.clear >> 8;
+        let share = (light * air.clear) >> 8;
         let red_blue = ((colour & RED_BLUE) * share + air.red_blue) >> 8;
         let green = ((colour >> 8 & 255) * share + air.green) >> 8;
         self.tone(red_blue, green, out);
