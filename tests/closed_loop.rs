@@ -75,7 +75,7 @@ struct StopsAfterAnEpoch<'a>(&'a AtomicBool);
 
 impl Observer for StopsAfterAnEpoch<'_> {
     fn notice(&mut self, _: &str) {}
-    fn progress(&mut self, _: u32, _: usize, _: usize) {}
+    fn progress(&mut self, _: u32, _: usize, _: usize, _: f64) {}
     fn epoch(&mut self, _: &EpochRecord, _: u32) {
         self.0.store(true, Ordering::Relaxed);
     }
