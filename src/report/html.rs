@@ -160,6 +160,9 @@ fn looks_like_a_number(text: &str) -> bool {
 }
 
 #[cfg(test)]
+pub(crate) use tests::assert_stands_alone;
+
+#[cfg(test)]
 mod tests {
     use super::*;
 
@@ -196,6 +199,3 @@ mod tests {
         assert!(!text.contains("url(") && !text.contains("@import"));
     }
 }
-
-#[cfg(test)]
-pub(crate) use tests::assert_stands_alone;

@@ -68,7 +68,7 @@ pub fn look(recording: &Recording, progress: &(dyn Fn(f64) + Sync)) -> Vec<Optio
 fn look_at(recording: &Recording, first: usize, end: usize) -> Vec<Option<(u64, Frame)>> {
     let mut eye = Eye::default();
     let mut sketch_of = |row: usize| eye.look(recording, row);
-    let mut before = first.checked_sub(1).and_then(|row| sketch_of(row));
+    let mut before = first.checked_sub(1).and_then(&mut sketch_of);
     let mut found: Vec<Option<(u64, Frame)>> = Vec::new();
     // One more than asked for: the turn of the last frame needs its follower.
     for row in first..(end + 1).min(recording.rows.len()) {

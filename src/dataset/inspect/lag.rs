@@ -58,7 +58,7 @@ impl Lag {
         // A movement lies between its frame and the next: half a row later than the frame.
         let rows = shifts[best] as f64 + offset + 0.5;
         let believed = correlation.min(whole_correlation) >= MIN_CORRELATION;
-        believed.then(|| Lag { ms: 1000.0 * rows * step_s, correlation, turn_at_full_lock })
+        believed.then_some(Lag { ms: 1000.0 * rows * step_s, correlation, turn_at_full_lock })
     }
 }
 
