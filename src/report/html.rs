@@ -159,8 +159,8 @@ fn looks_like_a_number(text: &str) -> bool {
         || matches!(text, "-" | "–")
 }
 
-#[cfg(test)]
 /// Checks that `text` is well-formed and that nothing in it makes a browser load something.
+#[cfg(test)]
 pub(super) fn assert_stands_alone(text: &str) {
     let options = roxmltree::ParsingOptions { allow_dtd: true, ..Default::default() };
     let document = roxmltree::Document::parse_with_options(text, options).unwrap();
