@@ -177,7 +177,7 @@ const KINDS: [Kind; 8] = [
     }),
     ("slow requests and slow frames", |port, turn| {
         let mut attack = if turn.is_multiple_of(2) { Attack::begin(port)? } else { Attack::open(port)? };
-        let bytes = if turn.is_multiple_of(2) { REQUEST } else { b"\x81\xfe\x10\x00\0\0\0\042[\"telemetry\"" };
+        let bytes = if turn.is_multiple_of(2) { REQUEST } else { b"\x81\xfe\x10\x00\x00\x00\x00\x0042[\"telemetry\"" };
         for byte in bytes.iter().take(20) {
             attack.say(&[*byte])?;
             std::thread::sleep(Duration::from_millis(50));
