@@ -52,7 +52,7 @@
 //!     fn notice(&mut self, text: &str) {
 //!         println!("{text}");
 //!     }
-//!     fn progress(&mut self, _epoch: u32, _images: usize, _of: usize) {}
+//!     fn progress(&mut self, _epoch: u32, _images: usize, _of: usize, _loss: f64) {}
 //!     fn epoch(&mut self, record: &EpochRecord, of: u32) {
 //!         println!("epoch {} of {of}: loss {:.4}", record.epoch, record.train_loss);
 //!     }

@@ -53,7 +53,7 @@ const PREPROCESSINGS: [(&str, &str); 10] = [
     ("hsv", "colour = 'hsv', rows = [2, 38], resize = [18, 25]"),
     ("hls", "colour = 'hls', interpolation = 'area', rows = [0, 37], resize = [17, 31], colour_first = true"),
     ("lab", "colour = 'lab', interpolation = 'area', rows = [10, 30], resize = [27, 60]"),
-    ("gray", "colour = 'gray', rows = [10, 30], resize = [20, 50], scale = 0.0078125, offset = -1.0"),
+    ("gray", "colour = 'gray', rows = [10, 30], resize = [20, 50], scale = 0.75, offset = 20.0"),
     ("rgb", "colour = 'rgb', rows = [10, 30], resize = [31, 77]"),
     ("yuv", "colour = 'yuv', interpolation = 'area', rows = [0, 40], resize = [16, 24]"),
     ("saturation", "colour = 'saturation', rows = [0, 40], resize = [20, 25], colour_first = true"),

@@ -73,7 +73,7 @@ fn a_log_without_images_and_a_short_one_have_a_page_too() {
 
 #[test]
 fn a_run_has_its_report_also_after_resume_and_runs_compare() {
-    let folder = folder_with_log(700);
+    let folder = folder_with_log(1200);
     let dir = folder.path();
     let train = ["train", "log", "--recipe", "lenet", "--json", "--set"];
     run(dir, &[&train[..], &["epochs=2", "--out", "a"]].concat());

@@ -248,15 +248,16 @@ mod tests {
         for i in 0..32 {
             parameters.values[i] = if i % 8 < 4 { -0.1 } else { 0.1 };
         }
-        // Blue stands where the road goes, red stands anywhere.
+        // The label is how blue one side is; red stands anywhere.
         let (mut images, mut labels) = (Vec::new(), Vec::new());
         for i in 0..60u8 {
             let (blue, red) = (i % 2 == 0, (i / 2) % 2 == 0);
+            let level = 20 + 3 * i;
             let pixel =
-                |x: usize| [if (x < 160) == red { 200 } else { 0 }, 90, if (x < 160) == blue { 0 } else { 150 + i }];
+                |x: usize| [if (x < 160) == red { 200 } else { 0 }, 90, if (x < 160) == blue { 0 } else { level }];
             let pixels = (0..160 * 320).flat_map(|place| pixel(place % 320)).collect();
             images.push(RgbImage { height: 160, width: 320, pixels });
-            labels.push(if blue { 0.5 } else { -0.5 });
+            labels.push(f32::from(level) / 400.0 * if blue { 1.0 } else { -1.0 });
         }
         let ranking = rank(&network, &parameters, &Frames { images, labels }, None).unwrap();
         assert_eq!(ranking[0].preprocessing.colour, Colour::Bgr);

@@ -128,9 +128,9 @@ mod tests {
         assert_relative_eq!(m.relative_to_zero.unwrap(), 0.08 / squares, max_relative = 1e-6);
         let variance = squares / 4.0 - 0.005f64.powi(2);
         assert_relative_eq!(m.r2.unwrap(), 1.0 - 0.02 / variance, max_relative = 1e-6);
-        // Deviations from the means 0.055 and 0.005.
-        let products = (-0.255 * -0.405) + (-0.035 * 0.015) + (0.345 * 0.395) + (0.145 * -0.005);
-        let (a, b): (f64, f64) = (0.065025 + 0.001225 + 0.119025 + 0.021025, 0.164025 + 0.000225 + 0.156025 + 0.000025);
+        // Deviations from the means 0.105 and 0.005.
+        let products = (-0.305 * -0.405) + (-0.085 * 0.015) + (0.295 * 0.395) + (0.095 * -0.005);
+        let (a, b): (f64, f64) = (0.093025 + 0.007225 + 0.087025 + 0.009025, 0.164025 + 0.000225 + 0.156025 + 0.000025);
         assert_relative_eq!(m.correlation.unwrap(), products / (a * b).sqrt(), max_relative = 1e-6);
         // 5.5° and 9.5° within 0.1 s each; the last row is another session.
         assert_relative_eq!(

@@ -87,6 +87,8 @@ pub(super) fn affine(code: &[u8]) -> Option<Affine> {
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Instruction {
     Argument,
+    /// Python 3.13 loads two variables with one instruction.
+    ArgumentTwice,
     Constant(usize),
     Add,
     Subtract,
@@ -156,6 +158,7 @@ impl Dialect {
             0 => return Some(None),
             _ if opcode == nothing => return Some(None),
             _ if opcode == load_argument && operand == 0 => Argument,
+            88 if operand == 0 && matches!(self, Dialect::Renumbered) => ArgumentTwice,
             _ if opcode == load_constant => Constant(operand),
             _ if opcode == negate => Negate,
             _ if opcode == give_back => Return,
@@ -179,12 +182,19 @@ enum Symbol {
     Expression(Affine),
 }
 
+/// x itself.
+const ARGUMENT: Symbol = Symbol::Expression(Affine { factor: 1.0, offset: 0.0 });
+
 /// Follows the instructions; `None` if they compute anything but one expression in x.
 fn run(instructions: &[Instruction], constants: &[std::rc::Rc<Object>]) -> Option<Affine> {
     let mut stack = Vec::new();
     for (place, instruction) in instructions.iter().enumerate() {
         let symbol = match *instruction {
-            Instruction::Argument => Symbol::Expression(Affine { factor: 1.0, offset: 0.0 }),
+            Instruction::Argument => ARGUMENT,
+            Instruction::ArgumentTwice => {
+                stack.push(ARGUMENT);
+                ARGUMENT
+            }
             Instruction::Constant(index) => match **constants.get(index)? {
                 Object::Integer(value) => Symbol::Number { value: value as f64, whole: true },
                 Object::Float(value) => Symbol::Number { value, whole: false },
