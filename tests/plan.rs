@@ -62,6 +62,16 @@ impl Setup {
 
 const NETWORKS: [(&str, &str); 3] = [("hyper", "[40, 44]"), ("lenet", "[30, 26]"), ("pilotnet", "[61, 65]")];
 
+/// Fewest blocks that `work` allocates in five goes: what the threads of the test harness allocate meanwhile counts too.
+fn allocations(mut work: impl FnMut()) -> u64 {
+    let one_go = |_| {
+        let before = dhat::HeapStats::get().total_blocks;
+        work();
+        dhat::HeapStats::get().total_blocks - before
+    };
+    (0..5).map(one_go).min().unwrap()
+}
+
 #[test]
 fn a_training_step_allocates_nothing() {
     let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
@@ -75,11 +85,11 @@ fn a_training_step_allocates_nothing() {
             for _ in 0..3 {
                 setup.step(&mut plan, &mut optimizer, &mut parameters);
             }
-            let before = dhat::HeapStats::get().total_blocks;
-            for _ in 0..20 {
-                setup.step(&mut plan, &mut optimizer, &mut parameters);
-            }
-            dhat::HeapStats::get().total_blocks - before
+            allocations(|| {
+                for _ in 0..5 {
+                    setup.step(&mut plan, &mut optimizer, &mut parameters);
+                }
+            })
         });
         assert_eq!(allocated, 0, "{recipe}");
     }
@@ -93,9 +103,8 @@ fn a_prediction_allocates_nothing() {
         let setup = Setup::new(recipe, size, 1);
         let (parameters, mut plan) = (setup.network.initialize(1), InferencePlan::new(&setup.network, 1));
         plan.run(&setup.network, &parameters, &setup.x, &mut [0.0]);
-        let before = dhat::HeapStats::get().total_blocks;
-        plan.run(&setup.network, &parameters, &setup.x, &mut [0.0]);
-        assert_eq!(dhat::HeapStats::get().total_blocks, before, "{recipe}");
+        let allocated = allocations(|| plan.run(&setup.network, &parameters, &setup.x, &mut [0.0]));
+        assert_eq!(allocated, 0, "{recipe}");
     }
 }
 
