@@ -225,6 +225,8 @@ fn another_client_drives_only_when_the_first_is_silent_or_gone() {
     // Now the first falls silent, and the telemetry that waits is answered.
     let answer = second.next();
     assert!(answer.contains("steer"), "{answer}");
+    // It waited; it was not silent.
+    assert_eq!(second.next_within(Duration::from_millis(100)), None);
     first.next_within(QUIET);
     assert!(first.next_within(Duration::from_secs(60)).is_none(), "the silent one is closed");
     drop(idle);

@@ -372,8 +372,10 @@ impl Connection<'_> {
     fn after_beat(&mut self) -> Result<(), End> {
         if let Some((text, came)) = self.held.take() {
             if self.may_answer() {
-                // Waiting for another client to leave is no delay of the answer.
-                let came = if self.waits { Instant::now() } else { came };
+                // Waiting for another client to leave is no delay of the answer, and no silence of this one.
+                let now = Instant::now();
+                let came = if self.waits { now } else { came };
+                self.last_telemetry = Some(now);
                 if let Ok(packet) = protocol::parse(&text) {
                     self.answer(packet, came)?;
                 }
