@@ -154,8 +154,8 @@ pub fn parse(text: &str) -> Result<ClientPacket<'_>, ProtocolError> {
         b'3' => Ok(ClientPacket::Pong),
         b'4' => parse_message(&text[1..]),
         b'0' | b'5' | b'6' => Ok(ClientPacket::Ignored),
-        b'{' | b'[' => Err(ProtocolError::PlainJson(shorten(text))),
-        _ => Err(ProtocolError::NotEngineIo(shorten(text))),
+        b'{' | b'[' => Err(ProtocolError::PlainJson(shorten(text, SHOWN))),
+        _ => Err(ProtocolError::NotEngineIo(shorten(text, SHOWN))),
     }
 }
 
@@ -172,7 +172,7 @@ fn parse_message(text: &str) -> Result<ClientPacket<'_>, ProtocolError> {
             parse_event(&rest[digits..], rest[..digits].parse().ok())
         }
         b'3'..=b'6' => Ok(ClientPacket::Ignored),
-        _ => Err(ProtocolError::Event(shorten(text))),
+        _ => Err(ProtocolError::Event(shorten(text, SHOWN))),
     }
 }
 
@@ -186,7 +186,8 @@ fn split_namespace(text: &str) -> (&str, &str) {
 }
 
 fn parse_event(json: &str, ack: Option<u64>) -> Result<ClientPacket<'_>, ProtocolError> {
-    let event: Event = serde_json::from_str(json).map_err(|e| ProtocolError::Event(e.to_string()))?;
+    let event: Event =
+        serde_json::from_str(json).map_err(|e| ProtocolError::Event(shorten(&e.to_string(), SHOWN_OF_ERROR)))?;
     Ok(match event {
         Event::Telemetry(Some(telemetry)) => ClientPacket::Telemetry(telemetry, ack),
         Event::Telemetry(None) => ClientPacket::Manual(ack),
@@ -194,11 +195,15 @@ fn parse_event(json: &str, ack: Option<u64>) -> Result<ClientPacket<'_>, Protoco
     })
 }
 
-/// The start of a text that is shown to a person.
-fn shorten(text: &str) -> String {
-    const SHOWN: usize = 40;
-    let mut short: String = text.chars().take(SHOWN).collect();
-    if text.chars().nth(SHOWN).is_some() {
+/// Characters of a message that are shown to a person.
+const SHOWN: usize = 40;
+/// Characters of an error about JSON that are shown: it can quote all of a long string.
+const SHOWN_OF_ERROR: usize = 160;
+
+/// The first `shown` characters of a text.
+fn shorten(text: &str, shown: usize) -> String {
+    let mut short: String = text.chars().take(shown).collect();
+    if text.chars().nth(shown).is_some() {
         short.push('…');
     }
     short

@@ -141,6 +141,9 @@ fn what_is_broken_is_an_error_and_no_panic() {
 fn errors_show_only_the_start_of_what_was_sent() {
     let error = parse(&"x".repeat(5000)).unwrap_err().to_string();
     assert!(error.len() < 120 && error.contains('…'), "{error}");
+    // The error about an object that is a string quotes the string.
+    let error = parse(&format!(r#"42["telemetry","{}"]"#, "x".repeat(500_000))).unwrap_err().to_string();
+    assert!(error.len() < 240 && error.contains("xxx") && error.ends_with('…'), "{:.300}", error);
 }
 
 #[test]
