@@ -298,6 +298,26 @@ fn without_telemetry_the_throttle_is_cut_and_the_simulator_is_asked() {
 }
 
 #[test]
+fn a_silent_car_that_is_not_driven_is_asked_and_nobody_claims_its_throttle_was_cut() {
+    let folder = folder_with_model();
+    let served = serve(&folder, &[]);
+    let ask = r#"42["manual",{}]"#;
+    let mut by_hand = served.connect_simulator();
+    by_hand.send(r#"42["telemetry",null]"#);
+    assert_eq!((by_hand.next(), by_hand.next()), (ask.into(), ask.into()), "the answer, and the question");
+    drop(by_hand);
+    let mut taken_over = served.connect_simulator();
+    turn(&mut taken_over, 10.0, &sample_jpeg());
+    taken_over.send(r#"42["telemetry",null]"#);
+    // On a slow machine the throttle is cut once before the person is noticed.
+    while taken_over.next() != ask {}
+    assert_eq!(taken_over.next(), ask);
+    let (summary, said) = served.stop();
+    assert!(count(&summary["events"], "silent") >= 2, "{summary}");
+    assert!(said.contains("it is asked for"), "{said}");
+}
+
+#[test]
 fn pings_are_answered_in_whatever_order() {
     let folder = folder_with_model();
     let served = serve(&folder, &[]);

@@ -390,10 +390,16 @@ impl Connection<'_> {
         self.keep_alive(now)?;
         match self.last_telemetry {
             None => self.miss_telemetry(now)?,
-            Some(last) if !self.lockstep && self.peer.stage() == Stage::Trusted => {
-                self.watch(now.saturating_duration_since(last), now)?;
+            // A client that waits for its answer or for another to leave is not silent.
+            Some(_) if self.lockstep || self.held.is_some() => {}
+            Some(last) => {
+                let silent = now.saturating_duration_since(last);
+                if self.peer.stage() == Stage::Trusted && !self.overridden {
+                    self.watch(silent, now)?;
+                } else {
+                    self.ask_again(silent, now, Event::Silent)?;
+                }
             }
-            Some(_) => {}
         }
         let quick = self.peer.stage() == Stage::Trusted
             || self.held.is_some()
@@ -446,25 +452,31 @@ impl Connection<'_> {
         Ok(())
     }
 
-    /// The driving client has been silent for `silent`.
+    /// The driven client has been silent for `silent`.
     fn watch(&mut self, silent: Duration, now: Instant) -> Result<(), End> {
         if silent < STALE_TIME {
             return Ok(());
         }
-        if !self.cut && !self.overridden {
+        if !self.cut {
             self.cut = true;
             self.last_question = now;
             let text = format_args!("{}: no telemetry for {:.1} s", self.address, silent.as_secs_f64());
             self.shared.journal.report(Event::Stale, text);
             let command = self.helm.cut_throttle();
-            self.steer(command)?;
-        } else if silent >= ASK_TIME && now.duration_since(self.last_question) >= ASK_TIME {
-            self.last_question = now;
-            let text = format_args!("{}: no telemetry for {:.0} s", self.address, silent.as_secs_f64());
-            self.shared.journal.report(Event::Stale, text);
-            self.ask()?;
+            return self.steer(command);
         }
-        Ok(())
+        self.ask_again(silent, now, Event::Stale)
+    }
+
+    /// Asks a client that has been silent for `silent`, now and then.
+    fn ask_again(&mut self, silent: Duration, now: Instant, event: Event) -> Result<(), End> {
+        if silent < ASK_TIME || now.duration_since(self.last_question) < ASK_TIME {
+            return Ok(());
+        }
+        self.last_question = now;
+        let text = format_args!("{}: no telemetry for {:.0} s", self.address, silent.as_secs_f64());
+        self.shared.journal.report(event, text);
+        self.ask()
     }
 
     /// Everything but telemetry.
