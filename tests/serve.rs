@@ -3,12 +3,13 @@
 
 mod common;
 
-use std::io::Write;
+use std::io::{BufRead, BufReader, Write};
 use std::path::Path;
+use std::process::Stdio;
 use std::time::Duration;
 
-use common::command::{error, json};
-use common::served::{Client, Served, command, random_model, sample_jpeg, telemetry};
+use common::command::{error, json, steersman};
+use common::served::{Client, SIMULATOR, Served, command, random_model, sample_jpeg, telemetry};
 use serde_json::Value;
 use steersman::pilot::Pilot;
 use steersman::serve::client::{ClientOptions, ClientReport, Numbers, Observer, Pace, drive};
@@ -330,6 +331,27 @@ fn pings_are_answered_in_whatever_order() {
     answers.sort();
     assert!(answers[0] == "3" && answers[1].starts_with(r#"42["steer""#), "{answers:?}");
     served.stop();
+}
+
+#[test]
+fn the_car_is_driven_on_and_told_to_roll_when_nobody_reads_the_log() {
+    let folder = folder_with_model();
+    let mut command_line = steersman(folder.path());
+    command_line.args(["serve", "model", "--port", "0", "--speed", "20", "--check", "--json"]);
+    let mut child = command_line.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    let mut line = String::new();
+    // As `head -1` does, it leaves after the first line.
+    BufReader::new(child.stderr.take().unwrap()).read_line(&mut line).unwrap();
+    let port = line.split("127.0.0.1:").nth(1).and_then(|rest| rest.split('/').next()).unwrap().parse().unwrap();
+    let mut client = Client::connect(port, SIMULATOR, 4);
+    let steering = turn(&mut client, 10.0, &sample_jpeg()).0;
+    assert!(std::process::Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap().success());
+    let mut last = client.next();
+    while let Some(text) = client.next_within(Duration::from_secs(60)) {
+        last = text;
+    }
+    assert_eq!(command(&last), (steering, 0.0));
+    assert!(child.wait_with_output().unwrap().status.success());
 }
 
 #[test]

@@ -2,6 +2,7 @@
 
 use std::io::{Read, Write};
 use std::net::SocketAddr;
+use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, PoisonError};
 use std::time::{Duration, Instant};
@@ -86,9 +87,10 @@ impl From<tungstenite::Error> for End {
 /// Serves one client until it leaves.
 pub(super) fn serve(shared: &Shared, peer: &Arc<Peer>, address: SocketAddr) {
     let result = open(shared, peer, address).and_then(|mut connection| {
-        let result = connection.run();
+        // The driven car gets its last words even if this program fails.
+        let result = catch_unwind(AssertUnwindSafe(|| connection.run()));
         connection.part();
-        result
+        result.unwrap_or_else(|panic| resume_unwind(panic))
     });
     let journal = &shared.journal;
     match result {
