@@ -46,6 +46,8 @@ const ASK_TIME: Duration = Duration::from_secs(1);
 const MISSING_TIME: Duration = Duration::from_secs(5);
 /// Bad messages in a row after which a client is closed that does not drive.
 const MAX_FAULTS: u32 = 10;
+/// A client that answers no ping, or never was of use, is given up after this time without a complete message.
+const SILENCE_LIMIT: Duration = Duration::from_millis(PING_INTERVAL_MS + PING_TIMEOUT_MS);
 /// Beat of a connection that waits for telemetry.
 const QUICK_BEAT: Duration = Duration::from_millis(10);
 /// Beat of one that has time.
@@ -425,8 +427,14 @@ impl Connection<'_> {
         Ok(())
     }
 
-    /// Pings of Engine.IO 4 come from the server.
+    /// Pings of Engine.IO 4 come from the server; whoever drives by another protocol pings by itself. So a stranger that
+    /// completes no message for as long as that is nobody.
     fn keep_alive(&mut self, now: Instant) -> Result<(), End> {
+        let silent = now.duration_since(self.last_message) > SILENCE_LIMIT;
+        if silent && self.peer.stage() != Stage::Trusted {
+            let text = format!("no complete message for {} s", SILENCE_LIMIT.as_secs());
+            return Err(End::Fault(Event::TooSlow, text));
+        }
         if !self.greeted || self.client.version == EngineVersion::V3 {
             return Ok(());
         }
@@ -434,7 +442,7 @@ impl Connection<'_> {
             self.last_ping = now;
             self.send(|out| out.push('2'))?;
         }
-        if now.duration_since(self.last_message) > Duration::from_millis(PING_INTERVAL_MS + PING_TIMEOUT_MS) {
+        if silent {
             return Err(End::Fault(Event::TooSlow, "no answer to pings".into()));
         }
         Ok(())
