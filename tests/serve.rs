@@ -319,6 +319,19 @@ fn a_silent_car_that_is_not_driven_is_asked_and_nobody_claims_its_throttle_was_c
 }
 
 #[test]
+fn control_characters_of_a_client_are_not_shown() {
+    let folder = folder_with_model();
+    let served = serve(&folder, &["--check"]);
+    let mut client = served.connect_simulator();
+    client.send("2\u{1b}[2J\u{9b}\rend");
+    assert_eq!(client.next(), "3\u{1b}[2J\u{9b}\rend");
+    let said = served.wait_until_it_says("< 3");
+    assert!(said.contains("> 2\u{fffd}[2J\u{fffd}\u{fffd}end"), "{said:?}");
+    let (_, said) = served.stop();
+    assert!(!said.contains(['\u{1b}', '\u{9b}', '\r']), "{said:?}");
+}
+
+#[test]
 fn pings_are_answered_in_whatever_order() {
     let folder = folder_with_model();
     let served = serve(&folder, &[]);

@@ -76,10 +76,10 @@ impl From<std::io::Error> for End {
 
 impl From<tungstenite::Error> for End {
     fn from(error: tungstenite::Error) -> End {
-        use tungstenite::error::ProtocolError::ResetWithoutClosingHandshake;
+        use tungstenite::error::ProtocolError::{ResetWithoutClosingHandshake, SendAfterClosing};
         match error {
             tungstenite::Error::ConnectionClosed | tungstenite::Error::AlreadyClosed => End::Closed,
-            tungstenite::Error::Protocol(ResetWithoutClosingHandshake) => End::Closed,
+            tungstenite::Error::Protocol(ResetWithoutClosingHandshake | SendAfterClosing) => End::Closed,
             tungstenite::Error::Io(error) => End::Broken(error),
             other => End::Fault(Event::BrokenFrames, other.to_string()),
         }
@@ -725,6 +725,8 @@ impl Connection<'_> {
         if self.shown <= ALL || self.shown.is_multiple_of(EVERY) {
             let shown = start(text);
             let rest = text.len() - shown.len();
+            // What a terminal would obey is not for it.
+            let shown: String = shown.chars().map(|c| if c.is_control() { '\u{fffd}' } else { c }).collect();
             let more = if rest > 0 { format!("… ({rest} bytes more)") } else { String::new() };
             self.shared.journal.step(format_args!("{} {direction} {shown}{more}", self.address));
         }
