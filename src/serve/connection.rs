@@ -11,7 +11,7 @@ use data_encoding::BASE64;
 use tungstenite::protocol::{Role, WebSocketConfig};
 use tungstenite::{Message, Utf8Bytes, WebSocket};
 
-use super::handshake::{Client, MAX_HEAD, Verdict, examine};
+use super::handshake::{Client, Verdict, examine};
 use super::helm::{Clock, Helm};
 use super::journal::Event;
 use super::pace::Pace;
@@ -125,7 +125,7 @@ fn open<'a>(shared: &'a Shared, peer: &'a Arc<Peer>, address: SocketAddr) -> Res
             return Err(End::Closed);
         }
         match examine(&head, &shared.options.allowed_origins) {
-            Verdict::Incomplete if began.elapsed() > HANDSHAKE_TIME || head.len() > MAX_HEAD + 1024 => {
+            Verdict::Incomplete if began.elapsed() > HANDSHAKE_TIME => {
                 let text = format!("no complete request within {} s", HANDSHAKE_TIME.as_secs());
                 return Err(End::Fault(Event::TooSlow, text));
             }
