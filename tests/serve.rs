@@ -3,12 +3,13 @@
 
 mod common;
 
-use std::io::Write;
+use std::io::{BufRead, BufReader, Write};
 use std::path::Path;
+use std::process::Stdio;
 use std::time::Duration;
 
-use common::command::{error, json};
-use common::served::{Client, Served, command, random_model, sample_jpeg, telemetry};
+use common::command::{error, json, steersman};
+use common::served::{Client, SIMULATOR, Served, command, random_model, sample_jpeg, telemetry};
 use serde_json::Value;
 use steersman::pilot::Pilot;
 use steersman::serve::client::{ClientOptions, ClientReport, Numbers, Observer, Pace, drive};
@@ -225,6 +226,8 @@ fn another_client_drives_only_when_the_first_is_silent_or_gone() {
     // Now the first falls silent, and the telemetry that waits is answered.
     let answer = second.next();
     assert!(answer.contains("steer"), "{answer}");
+    // It waited; it was not silent.
+    assert_eq!(second.next_within(Duration::from_millis(100)), None);
     first.next_within(QUIET);
     assert!(first.next_within(Duration::from_secs(60)).is_none(), "the silent one is closed");
     drop(idle);
@@ -296,6 +299,39 @@ fn without_telemetry_the_throttle_is_cut_and_the_simulator_is_asked() {
 }
 
 #[test]
+fn a_silent_car_that_is_not_driven_is_asked_and_nobody_claims_its_throttle_was_cut() {
+    let folder = folder_with_model();
+    let served = serve(&folder, &[]);
+    let ask = r#"42["manual",{}]"#;
+    let mut by_hand = served.connect_simulator();
+    by_hand.send(r#"42["telemetry",null]"#);
+    assert_eq!((by_hand.next(), by_hand.next()), (ask.into(), ask.into()), "the answer, and the question");
+    drop(by_hand);
+    let mut taken_over = served.connect_simulator();
+    turn(&mut taken_over, 10.0, &sample_jpeg());
+    taken_over.send(r#"42["telemetry",null]"#);
+    // On a slow machine the throttle is cut once before the person is noticed.
+    while taken_over.next() != ask {}
+    assert_eq!(taken_over.next(), ask);
+    let (summary, said) = served.stop();
+    assert!(count(&summary["events"], "silent") >= 2, "{summary}");
+    assert!(said.contains("it is asked for"), "{said}");
+}
+
+#[test]
+fn control_characters_of_a_client_are_not_shown() {
+    let folder = folder_with_model();
+    let served = serve(&folder, &["--check"]);
+    let mut client = served.connect_simulator();
+    client.send("2\u{1b}[2J\u{9b}\rend");
+    assert_eq!(client.next(), "3\u{1b}[2J\u{9b}\rend");
+    let said = served.wait_until_it_says("< 3");
+    assert!(said.contains("> 2\u{fffd}[2J\u{fffd}\u{fffd}end"), "{said:?}");
+    let (_, said) = served.stop();
+    assert!(!said.contains(['\u{1b}', '\u{9b}', '\r']), "{said:?}");
+}
+
+#[test]
 fn pings_are_answered_in_whatever_order() {
     let folder = folder_with_model();
     let served = serve(&folder, &[]);
@@ -308,6 +344,27 @@ fn pings_are_answered_in_whatever_order() {
     answers.sort();
     assert!(answers[0] == "3" && answers[1].starts_with(r#"42["steer""#), "{answers:?}");
     served.stop();
+}
+
+#[test]
+fn the_car_is_driven_on_and_told_to_roll_when_nobody_reads_the_log() {
+    let folder = folder_with_model();
+    let mut command_line = steersman(folder.path());
+    command_line.args(["serve", "model", "--port", "0", "--speed", "20", "--check", "--json"]);
+    let mut child = command_line.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    let mut line = String::new();
+    // As `head -1` does, it leaves after the first line.
+    BufReader::new(child.stderr.take().unwrap()).read_line(&mut line).unwrap();
+    let port = line.split("127.0.0.1:").nth(1).and_then(|rest| rest.split('/').next()).unwrap().parse().unwrap();
+    let mut client = Client::connect(port, SIMULATOR, 4);
+    let steering = turn(&mut client, 10.0, &sample_jpeg()).0;
+    assert!(std::process::Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap().success());
+    let mut last = client.next();
+    while let Some(text) = client.next_within(Duration::from_secs(60)) {
+        last = text;
+    }
+    assert_eq!(command(&last), (steering, 0.0));
+    assert!(child.wait_with_output().unwrap().status.success());
 }
 
 #[test]

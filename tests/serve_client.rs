@@ -82,7 +82,8 @@ fn in_lockstep_a_drive_over_the_wire_is_the_drive_in_this_process_bit_for_bit() 
             }
             let fields = fields(&text);
             decode_rgb(&BASE64.decode(fields["image"].as_str().unwrap().as_bytes()).unwrap(), &mut image).unwrap();
-            let throttle = controller.throttle_at(number(&fields, "time"), 20.0, number(&fields, "speed"));
+            let throttle =
+                controller.throttle_at(number(&fields, "steersman_lockstep_s"), 20.0, number(&fields, "speed"));
             let steering = away_from_light(&image.pixels);
             peer.send(&format!(r#"42["steer",{{"steering_angle":"{steering}","throttle":"{throttle}"}}]"#));
             telemetries += 1;
@@ -195,7 +196,10 @@ fn on_the_wire_it_is_websocket_sharp_to_the_byte() {
         ),
         "{first:.120}"
     );
-    assert!(first.ends_with(r#"","time":"0"}]"#) && second.ends_with(r#"","time":"0.06"}]"#));
+    assert!(
+        first.ends_with(r#"","steersman_lockstep_s":"0"}]"#)
+            && second.ends_with(r#"","steersman_lockstep_s":"0.06"}]"#)
+    );
     assert!(second.contains(r#""throttle":"0.1000""#), "{second:.120}");
     assert!(first.len() > 10_000 && frames.iter().any(|f| f.0 == 0), "a telemetry goes out in many pieces");
     assert_eq!((disconnect.as_str(), close.as_str(), close_frame.as_str()), ("41", "1", ""));
@@ -334,7 +338,7 @@ fn a_change_of_scene_ends_the_connection_without_a_word_and_starts_anew() {
     let report = drive_lake(&ClientOptions { scene_change_s: Some(0.5), ..lockstep(port, 11) });
     let (before, first) = server.join().unwrap();
     assert_eq!((before, report.connections, report.run.moments.len()), (10, 2, 1));
-    assert!(first.ends_with(r#""time":"0"}]"#));
+    assert!(first.ends_with(r#""steersman_lockstep_s":"0"}]"#));
 }
 
 #[test]

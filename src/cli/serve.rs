@@ -1,6 +1,6 @@
 //! `steersman serve`: drives Udacity's simulator, or any client that speaks its protocol.
 
-use std::io::IsTerminal;
+use std::io::{IsTerminal, Write as _};
 use std::net::{IpAddr, SocketAddr};
 use std::path::PathBuf;
 use std::sync::Mutex;
@@ -69,12 +69,12 @@ pub fn run(args: ServeArgs) -> Result<()> {
     })?;
     let stop = stop_on_ctrl_c()?;
     let address = server.address()?;
-    eprintln!("listening on ws://{address}/socket.io/");
+    say(&format!("listening on ws://{address}/socket.io/"));
     if args.port != 0 && args.port != protocol::DEFAULT_PORT {
-        eprintln!("note: Udacity's simulator connects to port {} by itself", protocol::DEFAULT_PORT);
+        say(&format!("note: Udacity's simulator connects to port {} by itself", protocol::DEFAULT_PORT));
     }
     if !args.host.is_loopback() {
-        eprintln!("note: whoever reaches {address} can connect; there is no password");
+        say(&format!("note: whoever reaches {address} can connect; there is no password"));
     }
     let screen = Screen::new();
     let summary = server.run(pilot, &screen, &stop)?;
@@ -109,6 +109,11 @@ fn print_summary(summary: &Summary) {
     }
 }
 
+/// Writes a line to standard error. Whoever reads it may have left, as in `2>&1 | head`; the car is driven on.
+fn say(text: &str) {
+    let _ = writeln!(std::io::stderr(), "{text}");
+}
+
 /// Standard error: on a terminal the status stays in the last line, elsewhere it is written now and then.
 struct Screen {
     bar: Option<ProgressBar>,
@@ -135,8 +140,8 @@ impl Screen {
 impl Console for Screen {
     fn line(&self, text: &str) {
         match &self.bar {
-            Some(bar) => bar.suspend(|| eprintln!("{text}")),
-            None => eprintln!("{text}"),
+            Some(bar) => bar.suspend(|| say(text)),
+            None => say(text),
         }
     }
 
@@ -150,7 +155,7 @@ impl Console for Screen {
         let mut last = self.last_plain.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
         if last.is_none_or(|last| last.elapsed() >= Self::PLAIN_INTERVAL) {
             *last = Some(Instant::now());
-            eprintln!("{text}");
+            say(text);
         }
     }
 }

@@ -19,14 +19,17 @@ use crate::simulator::drive::trajectory_csv;
 use crate::simulator::run::{Failure, line_errors_m};
 use crate::simulator::statistics::quantile;
 
-/// The address that Udacity's simulator has built in.
-const DEFAULT_URL: &str = "ws://127.0.0.1:4567/socket.io/?EIO=4&transport=websocket";
-
 /// Put the built-in simulator in the place of Udacity's: it connects to a driving server, as `serve` is one
 #[derive(Debug, Args)]
 pub struct SimArgs {
     /// The server; a path may be left out
-    #[arg(long, value_name = "URL", num_args = 0..=1, default_value = DEFAULT_URL, default_missing_value = DEFAULT_URL)]
+    #[arg(
+        long,
+        value_name = "URL",
+        num_args = 0..=1,
+        default_value = ServerUrl::DEFAULT,
+        default_missing_value = ServerUrl::DEFAULT
+    )]
     connect: ServerUrl,
     /// lake, mountain, coast, forest, random:SEED, or a track file
     #[arg(long)]

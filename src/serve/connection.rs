@@ -2,6 +2,7 @@
 
 use std::io::{Read, Write};
 use std::net::SocketAddr;
+use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, PoisonError};
 use std::time::{Duration, Instant};
@@ -10,7 +11,7 @@ use data_encoding::BASE64;
 use tungstenite::protocol::{Role, WebSocketConfig};
 use tungstenite::{Message, Utf8Bytes, WebSocket};
 
-use super::handshake::{Client, MAX_HEAD, Verdict, examine};
+use super::handshake::{Client, Verdict, examine};
 use super::helm::{Clock, Helm};
 use super::journal::Event;
 use super::pace::Pace;
@@ -45,6 +46,8 @@ const ASK_TIME: Duration = Duration::from_secs(1);
 const MISSING_TIME: Duration = Duration::from_secs(5);
 /// Bad messages in a row after which a client is closed that does not drive.
 const MAX_FAULTS: u32 = 10;
+/// A client that answers no ping, or never was of use, is given up after this time without a complete message.
+const SILENCE_LIMIT: Duration = Duration::from_millis(PING_INTERVAL_MS + PING_TIMEOUT_MS);
 /// Beat of a connection that waits for telemetry.
 const QUICK_BEAT: Duration = Duration::from_millis(10);
 /// Beat of one that has time.
@@ -73,10 +76,10 @@ impl From<std::io::Error> for End {
 
 impl From<tungstenite::Error> for End {
     fn from(error: tungstenite::Error) -> End {
-        use tungstenite::error::ProtocolError::ResetWithoutClosingHandshake;
+        use tungstenite::error::ProtocolError::{ResetWithoutClosingHandshake, SendAfterClosing};
         match error {
             tungstenite::Error::ConnectionClosed | tungstenite::Error::AlreadyClosed => End::Closed,
-            tungstenite::Error::Protocol(ResetWithoutClosingHandshake) => End::Closed,
+            tungstenite::Error::Protocol(ResetWithoutClosingHandshake | SendAfterClosing) => End::Closed,
             tungstenite::Error::Io(error) => End::Broken(error),
             other => End::Fault(Event::BrokenFrames, other.to_string()),
         }
@@ -86,9 +89,10 @@ impl From<tungstenite::Error> for End {
 /// Serves one client until it leaves.
 pub(super) fn serve(shared: &Shared, peer: &Arc<Peer>, address: SocketAddr) {
     let result = open(shared, peer, address).and_then(|mut connection| {
-        let result = connection.run();
+        // The driven car gets its last words even if this program fails.
+        let result = catch_unwind(AssertUnwindSafe(|| connection.run()));
         connection.part();
-        result
+        result.unwrap_or_else(|panic| resume_unwind(panic))
     });
     let journal = &shared.journal;
     match result {
@@ -121,7 +125,7 @@ fn open<'a>(shared: &'a Shared, peer: &'a Arc<Peer>, address: SocketAddr) -> Res
             return Err(End::Closed);
         }
         match examine(&head, &shared.options.allowed_origins) {
-            Verdict::Incomplete if began.elapsed() > HANDSHAKE_TIME || head.len() > MAX_HEAD + 1024 => {
+            Verdict::Incomplete if began.elapsed() > HANDSHAKE_TIME => {
                 let text = format!("no complete request within {} s", HANDSHAKE_TIME.as_secs());
                 return Err(End::Fault(Event::TooSlow, text));
             }
@@ -372,8 +376,10 @@ impl Connection<'_> {
     fn after_beat(&mut self) -> Result<(), End> {
         if let Some((text, came)) = self.held.take() {
             if self.may_answer() {
-                // Waiting for another client to leave is no delay of the answer.
-                let came = if self.waits { Instant::now() } else { came };
+                // Waiting for another client to leave is no delay of the answer, and no silence of this one.
+                let now = Instant::now();
+                let came = if self.waits { now } else { came };
+                self.last_telemetry = Some(now);
                 if let Ok(packet) = protocol::parse(&text) {
                     self.answer(packet, came)?;
                 }
@@ -388,10 +394,16 @@ impl Connection<'_> {
         self.keep_alive(now)?;
         match self.last_telemetry {
             None => self.miss_telemetry(now)?,
-            Some(last) if !self.lockstep && self.peer.stage() == Stage::Trusted => {
-                self.watch(now.saturating_duration_since(last), now)?;
+            // A client that waits for its answer or for another to leave is not silent.
+            Some(_) if self.lockstep || self.held.is_some() => {}
+            Some(last) => {
+                let silent = now.saturating_duration_since(last);
+                if self.peer.stage() == Stage::Trusted && !self.overridden {
+                    self.watch(silent, now)?;
+                } else {
+                    self.ask_again(silent, now, Event::Silent)?;
+                }
             }
-            Some(_) => {}
         }
         let quick = self.peer.stage() == Stage::Trusted
             || self.held.is_some()
@@ -415,8 +427,14 @@ impl Connection<'_> {
         Ok(())
     }
 
-    /// Pings of Engine.IO 4 come from the server.
+    /// Pings of Engine.IO 4 come from the server; whoever drives by another protocol pings by itself. So a stranger that
+    /// completes no message for as long as that is nobody.
     fn keep_alive(&mut self, now: Instant) -> Result<(), End> {
+        let silent = now.duration_since(self.last_message) > SILENCE_LIMIT;
+        if silent && self.peer.stage() != Stage::Trusted {
+            let text = format!("no complete message for {} s", SILENCE_LIMIT.as_secs());
+            return Err(End::Fault(Event::TooSlow, text));
+        }
         if !self.greeted || self.client.version == EngineVersion::V3 {
             return Ok(());
         }
@@ -424,7 +442,7 @@ impl Connection<'_> {
             self.last_ping = now;
             self.send(|out| out.push('2'))?;
         }
-        if now.duration_since(self.last_message) > Duration::from_millis(PING_INTERVAL_MS + PING_TIMEOUT_MS) {
+        if silent {
             return Err(End::Fault(Event::TooSlow, "no answer to pings".into()));
         }
         Ok(())
@@ -444,25 +462,31 @@ impl Connection<'_> {
         Ok(())
     }
 
-    /// The driving client has been silent for `silent`.
+    /// The driven client has been silent for `silent`.
     fn watch(&mut self, silent: Duration, now: Instant) -> Result<(), End> {
         if silent < STALE_TIME {
             return Ok(());
         }
-        if !self.cut && !self.overridden {
+        if !self.cut {
             self.cut = true;
             self.last_question = now;
             let text = format_args!("{}: no telemetry for {:.1} s", self.address, silent.as_secs_f64());
             self.shared.journal.report(Event::Stale, text);
             let command = self.helm.cut_throttle();
-            self.steer(command)?;
-        } else if silent >= ASK_TIME && now.duration_since(self.last_question) >= ASK_TIME {
-            self.last_question = now;
-            let text = format_args!("{}: no telemetry for {:.0} s", self.address, silent.as_secs_f64());
-            self.shared.journal.report(Event::Stale, text);
-            self.ask()?;
+            return self.steer(command);
         }
-        Ok(())
+        self.ask_again(silent, now, Event::Stale)
+    }
+
+    /// Asks a client that has been silent for `silent`, now and then.
+    fn ask_again(&mut self, silent: Duration, now: Instant, event: Event) -> Result<(), End> {
+        if silent < ASK_TIME || now.duration_since(self.last_question) < ASK_TIME {
+            return Ok(());
+        }
+        self.last_question = now;
+        let text = format_args!("{}: no telemetry for {:.0} s", self.address, silent.as_secs_f64());
+        self.shared.journal.report(event, text);
+        self.ask()
     }
 
     /// Everything but telemetry.
@@ -701,6 +725,8 @@ impl Connection<'_> {
         if self.shown <= ALL || self.shown.is_multiple_of(EVERY) {
             let shown = start(text);
             let rest = text.len() - shown.len();
+            // What a terminal would obey is not for it.
+            let shown: String = shown.chars().map(|c| if c.is_control() { '\u{fffd}' } else { c }).collect();
             let more = if rest > 0 { format!("… ({rest} bytes more)") } else { String::new() };
             self.shared.journal.step(format_args!("{} {direction} {shown}{more}", self.address));
         }

@@ -5,7 +5,7 @@ use tungstenite::handshake::derive_accept_key;
 use super::protocol::EngineVersion;
 
 /// Longest request, bytes.
-pub const MAX_HEAD: usize = 8 * 1024;
+const MAX_HEAD: usize = 8 * 1024;
 /// Most headers of a request.
 const MAX_HEADERS: usize = 64;
 
@@ -63,10 +63,10 @@ pub fn examine(head: &[u8], allowed_origins: &[String]) -> Verdict {
         }
         Err(_) => return refuse("400 Bad Request", "this is no HTTP request; a Socket.IO client is expected"),
     };
-    let header = |name: &str| {
-        let found = request.headers.iter().find(|header| header.name.eq_ignore_ascii_case(name));
-        found.and_then(|header| std::str::from_utf8(header.value).ok()).map(str::trim)
+    let bytes = |name: &str| {
+        request.headers.iter().find(|header| header.name.eq_ignore_ascii_case(name)).map(|header| header.value)
     };
+    let header = |name: &str| bytes(name).and_then(|value| std::str::from_utf8(value).ok()).map(str::trim);
     let has_token = |name: &str, token: &str| {
         header(name).is_some_and(|value| value.split(',').any(|part| part.trim().eq_ignore_ascii_case(token)))
     };
@@ -86,7 +86,9 @@ pub fn examine(head: &[u8], allowed_origins: &[String]) -> Verdict {
             "a WebSocket is expected here: start the simulator in autonomous mode, or connect a Socket.IO client with transports=['websocket']",
         );
     }
-    if let Some(origin) = header("origin")
+    // One that is no text is still the origin of a page.
+    let origin = bytes("origin").map(String::from_utf8_lossy);
+    if let Some(origin) = origin.as_deref().map(str::trim)
         && !is_allowed(origin, header("host").unwrap_or(""), allowed_origins)
     {
         return refuse(
@@ -198,6 +200,9 @@ mod tests {
         assert!(matches!(examine(library.as_bytes(), &[]), Verdict::Accept { .. }));
         assert_eq!(refusal(&with("Origin: http://127.0.0.1:8080")).0, "403");
         assert_eq!(refusal(&with("Origin: null")).0, "403");
+        let mut no_text = with("Origin: #").into_bytes();
+        no_text.iter_mut().filter(|byte| **byte == b'#').for_each(|byte| *byte = 0xff);
+        assert!(matches!(examine(&no_text, &[]), Verdict::Refuse { response, .. } if response.contains(" 403 ")));
     }
 
     #[test]

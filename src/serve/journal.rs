@@ -41,8 +41,10 @@ pub enum Event {
     BrokenEvent,
     /// Connected, but no telemetry.
     NoTelemetry,
-    /// Telemetry stopped.
+    /// Telemetry of the driven car stopped.
     Stale,
+    /// Telemetry of a car that is not driven stopped.
+    Silent,
     /// Telemetry without a picture.
     NoImage,
     /// Telemetry without a speed.
@@ -94,6 +96,9 @@ impl Event {
             Event::Stale => {
                 "the throttle is cut and telemetry asked for; is the simulator's window minimised, in a menu, or its machine \
                  overloaded?"
+            }
+            Event::Silent => {
+                "it is asked for; is the simulator's window minimised, in a menu, or its machine overloaded?"
             }
             Event::NoImage => "the throttle is cut; use a simulator with a front camera",
             Event::NoSpeed => "the throttle is cut; the field `speed` in mph is needed to hold a speed",

@@ -154,8 +154,8 @@ pub fn parse(text: &str) -> Result<ClientPacket<'_>, ProtocolError> {
         b'3' => Ok(ClientPacket::Pong),
         b'4' => parse_message(&text[1..]),
         b'0' | b'5' | b'6' => Ok(ClientPacket::Ignored),
-        b'{' | b'[' => Err(ProtocolError::PlainJson(shorten(text))),
-        _ => Err(ProtocolError::NotEngineIo(shorten(text))),
+        b'{' | b'[' => Err(ProtocolError::PlainJson(shorten(text, SHOWN))),
+        _ => Err(ProtocolError::NotEngineIo(shorten(text, SHOWN))),
     }
 }
 
@@ -172,7 +172,7 @@ fn parse_message(text: &str) -> Result<ClientPacket<'_>, ProtocolError> {
             parse_event(&rest[digits..], rest[..digits].parse().ok())
         }
         b'3'..=b'6' => Ok(ClientPacket::Ignored),
-        _ => Err(ProtocolError::Event(shorten(text))),
+        _ => Err(ProtocolError::Event(shorten(text, SHOWN))),
     }
 }
 
@@ -186,7 +186,8 @@ fn split_namespace(text: &str) -> (&str, &str) {
 }
 
 fn parse_event(json: &str, ack: Option<u64>) -> Result<ClientPacket<'_>, ProtocolError> {
-    let event: Event = serde_json::from_str(json).map_err(|e| ProtocolError::Event(e.to_string()))?;
+    let event: Event =
+        serde_json::from_str(json).map_err(|e| ProtocolError::Event(shorten(&e.to_string(), SHOWN_OF_ERROR)))?;
     Ok(match event {
         Event::Telemetry(Some(telemetry)) => ClientPacket::Telemetry(telemetry, ack),
         Event::Telemetry(None) => ClientPacket::Manual(ack),
@@ -194,11 +195,15 @@ fn parse_event(json: &str, ack: Option<u64>) -> Result<ClientPacket<'_>, Protoco
     })
 }
 
-/// The start of a text that is shown to a person.
-fn shorten(text: &str) -> String {
-    const SHOWN: usize = 40;
-    let mut short: String = text.chars().take(SHOWN).collect();
-    if text.chars().nth(SHOWN).is_some() {
+/// Characters of a message that are shown to a person.
+const SHOWN: usize = 40;
+/// Characters of an error about JSON that are shown: it can quote all of a long string.
+const SHOWN_OF_ERROR: usize = 160;
+
+/// The first `shown` characters of a text.
+fn shorten(text: &str, shown: usize) -> String {
+    let mut short: String = text.chars().take(shown).collect();
+    if text.chars().nth(shown).is_some() {
         short.push('…');
     }
     short
@@ -249,24 +254,39 @@ struct Fields<'a> {
     throttle: Number,
     speed: Number,
     cte: Number,
-    time: Number,
+    #[serde(rename = "steersman_lockstep_s", deserialize_with = "number_or_nothing")]
+    lockstep_s: Number,
     #[serde(borrow)]
     image: Option<Text<'a>>,
 }
 
 impl<'a> From<Fields<'a>> for Telemetry<'a> {
     fn from(fields: Fields<'a>) -> Telemetry<'a> {
-        let Fields { steering_angle, throttle, speed, cte, time, image } = fields;
+        let Fields { steering_angle, throttle, speed, cte, lockstep_s, image } = fields;
         Telemetry {
             steering_deg: steering_angle.value,
             throttle: throttle.value,
             speed_mph: speed.value,
             cte_m: cte.value,
-            time_s: time.value,
+            time_s: lockstep_s.value,
             image: image.map(|Text(image)| image),
             mark: speed.mark.or(steering_angle.mark).or(throttle.mark),
         }
     }
+}
+
+/// A number if it is one; anything else is no fault of a field that simulators do not have.
+fn number_or_nothing<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Number, D::Error> {
+    #[derive(Deserialize)]
+    #[serde(untagged)]
+    enum Anything {
+        Number(Number),
+        Other(IgnoredAny),
+    }
+    Ok(match Anything::deserialize(deserializer)? {
+        Anything::Number(number) => number,
+        Anything::Other(IgnoredAny) => Number::default(),
+    })
 }
 
 /// A number, or a string that holds one. What is neither, not even in another language, or not finite, is `None`.
@@ -462,7 +482,8 @@ pub struct Readings<'a> {
 }
 
 /// Appends a `telemetry` event as the simulator writes it: all numbers as strings with four decimals, in the order and
-/// language of the original. `time` is no field of the original; it stands last, as the shortest decimal, with a point.
+/// language of the original. `steersman_lockstep_s`, the simulated time, is no field of the original and has a name that no
+/// other simulator sends; it stands last, as the shortest decimal, with a point.
 pub fn print_telemetry(out: &mut String, readings: &Readings, mark: DecimalMark) {
     out.push_str("42[\"telemetry\",{");
     let mut field = |name: &str, value: f64| {
@@ -480,7 +501,7 @@ pub fn print_telemetry(out: &mut String, readings: &Readings, mark: DecimalMark)
     }
     push(out, format_args!("\"image\":\"{}\"", readings.image));
     if let Some(time_s) = readings.time_s {
-        push(out, format_args!(",\"time\":\"{time_s}\""));
+        push(out, format_args!(",\"steersman_lockstep_s\":\"{time_s}\""));
     }
     out.push_str("}]");
 }

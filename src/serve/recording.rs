@@ -4,7 +4,7 @@
 //! the bytes that came, not encoded again. Another thread writes, so that a slow disk costs rows and no time.
 
 use std::fs::{self, File};
-use std::io::{BufWriter, Write as _};
+use std::io::{BufWriter, ErrorKind, Write as _};
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
@@ -20,6 +20,9 @@ use crate::new_folder::create_now;
 
 /// Rows on their way to the disk; a second or two of driving.
 const QUEUE: usize = 64;
+
+/// Time in the names of pictures between two drives on simulated time, ms, so that they are not read as one.
+const BETWEEN_DRIVES_MS: u64 = 60_000;
 
 /// One answered frame.
 #[derive(Debug)]
@@ -60,6 +63,8 @@ struct State {
     last_ms: u64,
     /// Where simulated time 0 lies, ms since 1970.
     simulated_from_ms: u64,
+    /// Simulated time of the last row, s, unless it had none.
+    simulated_s: Option<f64>,
 }
 
 /// Whether a row is on its way.
@@ -88,7 +93,7 @@ impl Recorder {
         let (sender, receiver) = sync_channel(QUEUE);
         let thread = std::thread::Builder::new().name("recording".into());
         let writer = thread.spawn(move || write(&images, &log, file, &receiver)).map_err(Error::io(folder))?;
-        let state = State { dropped: 0, last_ms: 0, simulated_from_ms: now_ms() };
+        let state = State { dropped: 0, last_ms: 0, simulated_from_ms: now_ms(), simulated_s: None };
         Ok(Recorder { folder: folder.into(), sender, writer, state: Mutex::new(state) })
     }
 
@@ -96,8 +101,19 @@ impl Recorder {
     pub fn push(&self, clock: Clock, image: &[u8], command: Command, speed_mph: f64) -> Queued {
         let mut state = self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
         let taken_ms = match clock {
-            Clock::Arrival(_) => now_ms(),
-            Clock::Simulated(time_s) => state.simulated_from_ms.saturating_add((time_s.max(0.0) * 1e3).round() as u64),
+            Clock::Arrival(_) => {
+                state.simulated_s = None;
+                now_ms()
+            }
+            Clock::Simulated(time_s) => {
+                let simulated_ms = (time_s.max(0.0) * 1e3).round() as u64;
+                // Time that goes back is that of another drive, as is the first after frames with the server's time.
+                if state.last_ms > 0 && state.simulated_s.is_none_or(|last_s| time_s < last_s) {
+                    state.simulated_from_ms = (state.last_ms + BETWEEN_DRIVES_MS).saturating_sub(simulated_ms);
+                }
+                state.simulated_s = Some(time_s);
+                state.simulated_from_ms.saturating_add(simulated_ms)
+            }
         };
         // Names must differ, and the order of the rows is that of the frames.
         let time_ms = taken_ms.clamp(state.last_ms + 1, state.last_ms.max(now_ms()) + 24 * 3_600_000);
@@ -128,11 +144,23 @@ impl Recorder {
             .map_err(|_| Error::Usage("the recording ended early by a fault of this program".into()))??;
         let dropped = state.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner).dropped;
         if rows == 0 {
-            // Only files of this recording can be in there: the folder was new.
-            fs::remove_dir_all(&folder).map_err(Error::io(&folder))?;
+            remove_empty(&folder)?;
         }
         Ok(Recorded { folder, rows, dropped })
     }
+}
+
+/// Removes a recording without a row. What somebody else has put there meanwhile stays.
+fn remove_empty(folder: &Path) -> Result<()> {
+    let log = folder.join("driving_log.csv");
+    fs::remove_file(&log).map_err(Error::io(&log))?;
+    for made in [&folder.join("IMG"), folder] {
+        match fs::remove_dir(made) {
+            Err(error) if error.kind() == ErrorKind::DirectoryNotEmpty => {}
+            removed => removed.map_err(Error::io(made))?,
+        }
+    }
+    Ok(())
 }
 
 fn now_ms() -> u64 {
@@ -230,10 +258,28 @@ mod tests {
     }
 
     #[test]
-    fn nothing_recorded_leaves_nothing_behind() {
+    fn two_drives_on_simulated_time_are_two_sessions() {
+        let scratch = tempfile::tempdir().unwrap();
+        let folder = scratch.path().join("drive");
+        let recorder = Recorder::start(&folder).unwrap();
+        for time_s in [0.0, 0.06, 0.1, 0.0, 0.06, 0.1] {
+            assert_eq!(recorder.push(Clock::Simulated(time_s), &image(), Command::default(), 0.0), Queued::Yes);
+        }
+        recorder.finish().unwrap();
+        let recording = dataset::load(&folder).unwrap();
+        assert_eq!((recording.rows.len(), recording.sessions.len()), (6, 2));
+    }
+
+    #[test]
+    fn nothing_recorded_leaves_nothing_behind_but_what_others_put_there() {
         let scratch = tempfile::tempdir().unwrap();
         let folder = scratch.path().join("drive");
         assert_eq!(Recorder::start(&folder).unwrap().finish().unwrap().rows, 0);
         assert!(!folder.exists());
+        let recorder = Recorder::start(&folder).unwrap();
+        fs::write(folder.join("notes.txt"), "wet road").unwrap();
+        assert_eq!(recorder.finish().unwrap().rows, 0);
+        let left: Vec<_> = fs::read_dir(&folder).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+        assert_eq!(left, ["notes.txt"]);
     }
 }

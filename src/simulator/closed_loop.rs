@@ -81,6 +81,13 @@ impl<'a> ClosedLoop<'a> {
         self.simulation.progress_m < self.way_m && self.simulation.steps < self.most_steps && self.run.failure.is_none()
     }
 
+    /// Whether the run ends because it has taken far longer than a slow car needs.
+    pub fn is_too_slow(&self) -> bool {
+        self.simulation.progress_m < self.way_m
+            && self.simulation.steps >= self.most_steps
+            && self.run.failure.is_none()
+    }
+
     /// Whether a frame is to be answered before the next step.
     pub fn frame_is_due(&self) -> bool {
         self.simulation.steps * DRIVE_HZ >= self.frames * STEPS_PER_S

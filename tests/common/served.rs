@@ -27,6 +27,9 @@ pub fn random_model(path: &Path, recipe: &str) {
     Model { recipe, parameters, record, training_rows: vec![] }.save(path).unwrap();
 }
 
+/// The program that Udacity's simulator says it is.
+pub const SIMULATOR: &str = "websocket-sharp/1.0";
+
 /// A running server.
 pub struct Served {
     child: Child,
@@ -110,21 +113,17 @@ impl Served {
 
     /// A TCP connection.
     pub fn connect_tcp(&self) -> TcpStream {
-        let stream = TcpStream::connect(("127.0.0.1", self.port)).unwrap();
-        stream.set_read_timeout(Some(SILENCE)).unwrap();
-        stream
+        connect_tcp(self.port)
     }
 
     /// A WebSocket of the program `agent`.
     pub fn connect(&self, agent: &str, eio: u32) -> Client {
-        let uri = format!("ws://127.0.0.1:{}/socket.io/?EIO={eio}&transport=websocket", self.port);
-        let request = ClientRequestBuilder::new(uri.parse().unwrap()).with_header("User-Agent", agent);
-        Client(tungstenite::client(request, self.connect_tcp()).unwrap().0)
+        Client::connect(self.port, agent, eio)
     }
 
     /// A WebSocket that the server takes for the simulator's.
     pub fn connect_simulator(&self) -> Client {
-        self.connect("websocket-sharp/1.0", 4)
+        self.connect(SIMULATOR, 4)
     }
 }
 
@@ -136,10 +135,23 @@ impl Drop for Served {
     }
 }
 
+fn connect_tcp(port: u16) -> TcpStream {
+    let stream = TcpStream::connect(("127.0.0.1", port)).unwrap();
+    stream.set_read_timeout(Some(SILENCE)).unwrap();
+    stream
+}
+
 /// A client of few words.
 pub struct Client(pub WebSocket<TcpStream>);
 
 impl Client {
+    /// A WebSocket of the program `agent` to the server at `port`.
+    pub fn connect(port: u16, agent: &str, eio: u32) -> Client {
+        let uri = format!("ws://127.0.0.1:{port}/socket.io/?EIO={eio}&transport=websocket");
+        let request = ClientRequestBuilder::new(uri.parse().unwrap()).with_header("User-Agent", agent);
+        Client(tungstenite::client(request, connect_tcp(port)).unwrap().0)
+    }
+
     /// Sends a text.
     pub fn send(&mut self, text: &str) {
         self.0.send(Message::text(text)).unwrap();

@@ -199,18 +199,32 @@ impl Link {
         }
     }
 
+    /// The first address of the host at which somebody listens: `localhost` may be `::1` before it is `127.0.0.1`.
+    fn reach(&self) -> io::Result<TcpStream> {
+        let mut error = io::Error::other("the host has no address");
+        for address in self.url.address().to_socket_addrs()? {
+            match TcpStream::connect_timeout(&address, IO_LIMIT) {
+                Ok(stream) => return Ok(stream),
+                Err(failed) => error = failed,
+            }
+            if !self.sleep(Duration::ZERO) {
+                break;
+            }
+        }
+        Err(error)
+    }
+
     fn connect(&self, keys: &mut Rng) -> io::Result<FrameReader<BufReader<TcpStream>>> {
         // Nagle's algorithm stays on: websocket-sharp does not turn it off.
-        let mut addresses = self.url.address().to_socket_addrs()?;
-        let address = addresses.next().ok_or_else(|| io::Error::other("the host has no address"))?;
-        let mut stream = TcpStream::connect_timeout(&address, IO_LIMIT)?;
+        let mut stream = self.reach()?;
         stream.set_write_timeout(Some(IO_LIMIT))?;
         stream.set_read_timeout(Some(IO_LIMIT))?;
         let mut reader = BufReader::new(stream.try_clone()?);
         shake_hands(&mut stream, &mut reader, &self.url, keys)?;
         stream.set_read_timeout(None)?;
         *self.writer() = Some(FrameWriter::new(stream, keys.next_u64()));
-        Ok(FrameReader::new(reader))
+        // Whoever stopped this before that line found nothing to shut down.
+        if self.sleep(Duration::ZERO) { Ok(FrameReader::new(reader)) } else { Err(io::ErrorKind::Interrupted.into()) }
     }
 
     /// Reads until the connection ends; why it did.

@@ -23,13 +23,15 @@ pub struct ServerUrl {
 }
 
 impl Default for ServerUrl {
-    /// The address that is built into Udacity's simulator.
     fn default() -> Self {
-        ServerUrl { authority: "127.0.0.1:4567".into(), path: "/socket.io/?EIO=4&transport=websocket".into() }
+        ServerUrl::DEFAULT.parse().expect("the built-in address is one")
     }
 }
 
 impl ServerUrl {
+    /// The address that is built into Udacity's simulator.
+    pub const DEFAULT: &str = "ws://127.0.0.1:4567/socket.io/?EIO=4&transport=websocket";
+
     /// `host:port` to connect to.
     pub fn address(&self) -> String {
         let has_port = self.authority.rsplit_once(':').is_some_and(|(_, port)| port.parse::<u16>().is_ok());

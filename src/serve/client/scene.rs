@@ -263,6 +263,10 @@ impl<'a> Scene<'a> {
                 Some(clock) => self.frame(&mut closed_loop, clock)?,
             }
         }
+        if closed_loop.is_too_slow() {
+            let time_s = closed_loop.simulation().time_s();
+            self.observer.notice(&format!("the run ends after {time_s:.0} s: the car is far too slow for its laps"));
+        }
         Ok(closed_loop.finish())
     }
 

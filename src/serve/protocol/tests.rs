@@ -102,6 +102,17 @@ fn the_other_packets() {
 }
 
 #[test]
+fn only_the_own_name_of_simulated_time_counts_and_nothing_in_it_breaks_telemetry() {
+    assert_eq!(telemetry(r#"42["telemetry",{"speed":"1","time":"12.5","image":"AA=="}]"#).time_s, None);
+    assert_eq!(telemetry(r#"42["telemetry",{"steersman_lockstep_s":12.5}]"#).time_s, Some(12.5));
+    for value in ["null", "true", "[1,[2]]", r#"{"s":{"x":1}}"#, r#""soon""#, r#""\u0041""#, "\"NaN\""] {
+        let text = format!(r#"42["telemetry",{{"steersman_lockstep_s":{value},"speed":"1","image":"AA=="}}]"#);
+        let read = telemetry(&text);
+        assert_eq!((read.time_s, read.speed_mph, read.image.as_deref()), (None, Some(1.0), Some("AA==")), "{text}");
+    }
+}
+
+#[test]
 fn what_is_broken_is_an_error_and_no_panic() {
     assert!(matches!(parse(""), Err(ProtocolError::NotEngineIo(_))));
     assert!(matches!(parse("hello"), Err(ProtocolError::NotEngineIo(_))));
@@ -141,6 +152,9 @@ fn what_is_broken_is_an_error_and_no_panic() {
 fn errors_show_only_the_start_of_what_was_sent() {
     let error = parse(&"x".repeat(5000)).unwrap_err().to_string();
     assert!(error.len() < 120 && error.contains('…'), "{error}");
+    // The error about an object that is a string quotes the string.
+    let error = parse(&format!(r#"42["telemetry","{}"]"#, "x".repeat(500_000))).unwrap_err().to_string();
+    assert!(error.len() < 240 && error.contains("xxx") && error.ends_with('…'), "{:.300}", error);
 }
 
 #[test]
@@ -179,7 +193,7 @@ fn telemetry_is_printed_as_the_simulator_does() {
     out.clear();
     print_telemetry(&mut out, &readings, DecimalMark::COMMA);
     assert!(out.contains(r#""steering_angle":"-12,5000","throttle":"0,0000","speed":"0,4380""#), "{out}");
-    assert!(out.ends_with(r#"","time":"0.30000000000000004"}]"#), "{out}");
+    assert!(out.ends_with(r#"","steersman_lockstep_s":"0.30000000000000004"}]"#), "{out}");
     let read = telemetry(&out);
     assert_eq!((read.time_s, read.mark), (Some(0.1 + 0.2), Some(DecimalMark::COMMA)));
 }
