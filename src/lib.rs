@@ -130,7 +130,7 @@
 //!
 //!     fn infer(&self, _: &[f32], _: &[f32], _: usize, x: &[f32], y: &mut [f32], _: &mut [f32]) {
 //!         for (y, x) in y.iter_mut().zip(x) {
-//!             *y = x.exp().ln_1p();
+//!             *y = x.max(0.0) + (-x.abs()).exp().ln_1p(); // eˣ itself would overflow
 //!         }
 //!     }
 //!

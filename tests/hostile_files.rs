@@ -297,4 +297,46 @@ fn valid_files_that_mean_harm_are_refused() {
     // An archive of nothing, and one without weights.
     assert!(!refused(&archive(&[])).is_empty());
     assert!(!refused(&archive(&entries[..1])).is_empty());
+
+    // JSON that is much larger when it is parsed: refused by its length, or within the bound.
+    for len in [3 << 20, 1 << 20] {
+        entries[place].1 = b"[".iter().chain(b"0,".repeat(len / 2 - 2).iter()).chain(b"0]").copied().collect();
+        let message = refused(&archive(&entries));
+        let expected = if len > 1 << 20 { "unpacks to more than" } else { "has 524287 layers" };
+        assert!(message.contains(expected), "{message}");
+        let path = folder.path().join("long.json");
+        std::fs::write(&path, &entries[place].1).unwrap();
+        let options = ImportOptions { architecture: Some(path), ..ImportOptions::default() };
+        assert!(import(&golden("keras1-theano-weights.h5"), &options).is_err());
+    }
+}
+
+/// Sizes whose products do not fit into a machine's word, or into its memory.
+#[test]
+fn maps_beyond_all_measure_are_refused() {
+    let _alone = ALONE.lock();
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("architecture.json");
+    let refused = |layers: &str| {
+        std::fs::write(&path, format!(r#"{{"class_name": "Sequential", "config": [{layers}]}}"#)).unwrap();
+        let options = ImportOptions { architecture: Some(path.clone()), ..ImportOptions::default() };
+        let before = MEMORY.allocated();
+        MEMORY.set_limit(before + MAX_BYTES).unwrap();
+        let message = import(&golden("keras1-theano-weights.h5"), &options).unwrap_err().to_string();
+        MEMORY.set_limit(1 << 30).unwrap();
+        message
+    };
+    let input = |shape: &str| {
+        format!(r#"{{"class_name": "InputLayer", "config": {{"name": "in", "batch_input_shape": [null, {shape}]}}}}"#)
+    };
+    for shape in ["1e9, 1e9, 1e9", "8193, 1, 1", "1, 8193, 1", "1, 1, 1e9", "8192, 8192, 2"] {
+        let message = refused(&input(shape));
+        assert!(message.contains("is too large"), "{shape}: {message}");
+    }
+    let padding = r#"{"class_name": "ZeroPadding2D", "config": {"name": "pad", "padding": [1e9, 1e9]}}"#;
+    let message = refused(&format!("{}, {padding}", input("20, 28, 3")));
+    assert!(message.contains("pad (ZeroPadding2D): a map of 2000000020x2000000028x3 is too large"), "{message}");
+    let conv = r#"{"class_name": "Conv2D", "config": {"name": "conv", "filters": 1e9, "kernel_size": [1e9, 1e9], "padding": "same"}}"#;
+    let message = refused(&format!("{}, {conv}", input("20, 28, 3")));
+    assert!(message.contains("conv (Conv2D): tensor"), "{message}");
 }

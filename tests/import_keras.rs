@@ -116,8 +116,104 @@ fn an_imported_model_is_like_any_other() {
     let frame = std::fs::read_dir(Path::new(&log).join("IMG")).unwrap().next().unwrap().unwrap().path();
     run(folder.path(), &["predict", "m.safetensors", frame.to_str().unwrap()]);
 
+    for (format, file) in [("c", "model.c"), ("rust", "model.rs"), ("onnx", "model.onnx")] {
+        run(folder.path(), &["export", "m.safetensors", file, "--to", format]);
+        assert!(std::fs::metadata(folder.path().join(file)).unwrap().len() > 4 * 2450, "{file}");
+    }
+    let trained = json(
+        folder.path(),
+        &["train", &log, "--from", "m.safetensors", "--set", "epochs=1", "--set", "batch=8", "--out", "run", "--json"],
+    );
+    let trained = trained["model"].as_str().unwrap_or_else(|| panic!("no model in {trained}")).to_string();
+    assert_eq!(json(folder.path(), &["evaluate", &trained, &log, "--json"])["rows"], 30);
+    run(folder.path(), &["explain", "m.safetensors", frame.to_str().unwrap(), "--out", "seen"]);
+    assert!(folder.path().join("seen/explain.html").is_file());
+
     let again = error(folder.path(), &["import", golden("keras2.h5").to_str().unwrap(), "--out", "m.safetensors"]);
     assert!(again.contains("m.safetensors exists"), "{again}");
+}
+
+/// Driven and served, an imported model goes the same way.
+#[cfg(unix)]
+#[test]
+fn an_imported_model_drives_and_is_served() {
+    let folder = tempfile::tempdir().unwrap();
+    run(folder.path(), &["import", golden("keras2.h5").to_str().unwrap(), "--out", "m.safetensors"]);
+    let served = common::served::Served::start(folder.path(), "m.safetensors", &["--speed", "20"]);
+    let url = format!("ws://127.0.0.1:{}", served.port);
+    let way = ["--track", "lake", "--seed", "5", "--json"];
+    let driven = json(folder.path(), &[&["drive", "m.safetensors", "--runs", "1"][..], &way].concat());
+    let simulated = json(folder.path(), &[&["sim", "--connect", &url, "--lockstep"][..], &way].concat());
+    assert!(driven["distance_m"].as_f64().unwrap() > 1.0, "{driven}");
+    assert_eq!(driven["distance_m"], simulated["distance_m"]);
+    served.stop();
+}
+
+#[test]
+fn a_preprocessing_that_fits_badly_is_taken_with_a_warning() {
+    let folder = tempfile::tempdir().unwrap();
+    let log = painted_log::write(&folder.path().join("log"), 200, "");
+    // The labels of other pictures: nothing goes with them.
+    let shuffled: Vec<String> = std::fs::read_to_string(&log)
+        .unwrap()
+        .lines()
+        .enumerate()
+        .map(|(row, line)| {
+            let mut fields: Vec<&str> = line.split(", ").collect();
+            let label = format!("{}", 0.4 * unit(hash("labels")(row)));
+            if row > 0 {
+                fields[3] = &label;
+            }
+            fields.join(", ")
+        })
+        .collect();
+    std::fs::write(&log, shuffled.join("\n")).unwrap();
+    let file = golden("keras2.h5");
+    let args = ["import", file.to_str().unwrap(), "--out", "m.safetensors", "--fit", "log"];
+    let output = run(folder.path(), &args);
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert!(said.contains("warning: no preprocessing fits"), "{said}\n{}", String::from_utf8_lossy(&output.stdout));
+}
+
+/// The architecture of `keras1-theano.json`, which is JSON in a string, with its list of layers changed.
+fn changed_architecture(path: &Path, change: impl Fn(&mut Vec<Value>)) {
+    let text: String = serde_json::from_str(&std::fs::read_to_string(golden("keras1-theano.json")).unwrap()).unwrap();
+    let mut model: Value = serde_json::from_str(&text).unwrap();
+    change(model["config"].as_array_mut().unwrap());
+    std::fs::write(path, model.to_string()).unwrap();
+}
+
+#[test]
+fn several_outputs_or_another_preprocessing_are_refused_before_anything_is_fitted() {
+    let folder = tempfile::tempdir().unwrap();
+    painted_log::write(&folder.path().join("log"), 30, "");
+    let refused = |args: &[&str]| error(folder.path(), &[&["import", "--fit", "log"], args].concat());
+    let keras1 = golden("keras1.h5");
+    let message = refused(&[keras1.to_str().unwrap(), "--preprocessing", "oargueta"]);
+    assert!(message.contains("takes images of 20x28 with 3 colour planes"), "{message}");
+
+    std::fs::write(folder.path().join("p.toml"), "resize = [20, 28]").unwrap();
+    changed_architecture(&folder.path().join("several.json"), |layers| drop(layers.pop()));
+    let weights = golden("keras1-theano-weights.h5");
+    let weights = [weights.to_str().unwrap(), "--preprocessing", "p.toml", "--architecture", "several.json"];
+    let message = refused(&weights);
+    assert!(message.contains("gives 6 numbers for an image"), "{message}");
+}
+
+#[test]
+fn names_of_the_file_reach_the_terminal_short_and_tame() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("names.json");
+    changed_architecture(&path, |layers| {
+        for number in 0..30 {
+            let name = format!("\u{1b}[31m{number}{}", "long".repeat(1000));
+            layers.push(serde_json::json!({"class_name": name, "config": {"name": name}}));
+        }
+    });
+    let options = ImportOptions { architecture: Some(path), ..ImportOptions::default() };
+    let message = import(&golden("keras1-theano-weights.h5"), &options).unwrap_err().to_string();
+    assert!(message.contains("30 layers cannot be imported") && message.ends_with("and 10 more"), "{message}");
+    assert!(!message.contains('\u{1b}') && message.len() < 10_000, "{message}");
 }
 
 #[test]

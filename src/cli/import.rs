@@ -52,6 +52,9 @@ pub struct ImportArgs {
     json: bool,
 }
 
+/// A model under the right preprocessing goes with the labels better than this.
+const WEAK_CORRELATION: f64 = 0.3;
+
 fn parse_lambda(text: &str) -> Result<(String, (f64, f64)), String> {
     let (layer, numbers) = text.split_once('=').ok_or("expected LAYER=A,B, as in lambda_1=127.5,1")?;
     let (a, b) = numbers.split_once(',').ok_or("expected two numbers: LAYER=A,B, as in lambda_1=127.5,1")?;
@@ -102,6 +105,9 @@ pub fn run(args: ImportArgs) -> Result<()> {
     for notice in &imported.notices {
         eprintln!("note: {notice}");
     }
+    if let Some(given) = &given {
+        imported.check_input(given)?;
+    }
     let network = Network::new(imported.input, &imported.layers, Isa::best())?;
 
     let ranking = match &args.fit {
@@ -117,7 +123,17 @@ pub fn run(args: ImportArgs) -> Result<()> {
     };
     let preprocessing = match (given, ranking.first()) {
         (Some(given), _) => given,
-        (None, Some(best)) => best.preprocessing.clone(),
+        (None, Some(best)) => {
+            if best.correlation.is_none_or(|correlation| correlation < WEAK_CORRELATION) {
+                eprintln!(
+                    "warning: no preprocessing fits: the best one has a correlation of {} with the labels. The right one may \
+                     not be among those that were tried, or the model was trained for another kind of picture; name it with \
+                     --preprocessing",
+                    or_dash(best.correlation, 3)
+                );
+            }
+            best.preprocessing.clone()
+        }
         (None, None) => {
             let guess = whole_image(imported.input)?;
             eprintln!(

@@ -1,5 +1,6 @@
 //! A network without its training: a chain of operations with their numbers.
 
+use crate::error::{Error, Result};
 use crate::network::{LayerSpec, NamedLayer, Network, Parameters};
 use crate::tensor::Shape;
 
@@ -145,6 +146,30 @@ pub(crate) fn scale_and_shift(gamma: &[f32], beta: &[f32], mean: &[f32], varianc
     Affine { scale, shift }
 }
 
+/// Refuses numbers that are not finite, which a file of an exported model could not say or would compute nonsense with: those
+/// that folding made, and the scales and shifts of the batch normalisation that is left, as the 32-bit numbers they become.
+pub(crate) fn check_finite(steps: &[Step]) -> Result<()> {
+    for Step { name, op, .. } in steps {
+        let is_finite = match op {
+            Op::Conv { weight, bias, .. } | Op::Dense { weight, bias } => {
+                weight.iter().chain(bias).all(|value| value.is_finite())
+            }
+            Op::BatchNorm { gamma, beta, mean, variance, epsilon } => {
+                let Affine { scale, shift } = scale_and_shift(gamma, beta, mean, variance, *epsilon);
+                scale.iter().chain(&shift).all(|value| (*value as f32).is_finite())
+            }
+            Op::PRelu { slopes } => slopes.iter().all(|value| value.is_finite()),
+            Op::Scale { factor, offset } => factor.is_finite() && offset.is_finite(),
+            _ => true,
+        };
+        if !is_finite {
+            let message = "its weights, with batch normalisation worked into them, are not finite".into();
+            return Err(Error::Network { layer: name.clone(), message });
+        }
+    }
+    Ok(())
+}
+
 /// `x · scale + shift` in each channel.
 pub(crate) struct Affine {
     pub scale: Vec<f64>,
@@ -209,6 +234,25 @@ mod tests {
         );
         let chain = chain(&network, &parameters);
         assert_eq!(fold_batch_norm(chain.clone()), chain);
+    }
+
+    #[test]
+    fn numbers_that_are_not_finite_are_refused_folded_or_not() {
+        let layers = "{kind='batch_norm'}, {kind='conv2d', filters=3, kernel=[3, 3]}, {kind='batch_norm'}";
+        let (network, sound) = network(layers);
+        check_finite(&fold_batch_norm(chain(&network, &sound))).unwrap();
+        for (name, refused) in [("bn1", "bn1"), ("bn2", "conv1")] {
+            let mut parameters = sound.clone();
+            for tensor in network.tensors() {
+                match tensor.name.strip_prefix(name) {
+                    Some(".running_variance") => parameters.tensor_mut(tensor).fill(1e-20),
+                    Some(".gamma" | ".running_mean") => parameters.tensor_mut(tensor).fill(3e38),
+                    _ => {}
+                }
+            }
+            let error = check_finite(&fold_batch_norm(chain(&network, &parameters))).unwrap_err().to_string();
+            assert!(error.contains(refused) && error.contains("not finite"), "{error}");
+        }
     }
 
     #[test]

@@ -201,6 +201,7 @@ fn judge(
     let [height, width] = preprocessing.source;
     let mut preprocessor = preprocessing.plan(height, width)?;
     let mut plan = InferencePlan::new(network, 1);
+    plan.prepare(network, parameters);
     let mut planes = vec![0; preprocessing.output_len()];
     let mut input = vec![0.0; preprocessing.output_len()];
     let mut pairs = Vec::new();
@@ -208,7 +209,7 @@ fn judge(
         preprocessor.apply(&frames.images[index].pixels, &mut planes);
         preprocessing.to_input(&planes, &mut input);
         let mut steering = [0.0];
-        plan.run(network, parameters, &input, &mut steering);
+        plan.run_prepared(network, parameters, &input, &mut steering);
         pairs.push((f64::from(steering[0]), f64::from(frames.labels[index])));
     }
     Ok(correlation(pairs.into_iter()))

@@ -4,7 +4,7 @@ use steersman_kernels::activation;
 use steersman_kernels::pool::{self, PoolShape};
 use steersman_kernels::{Isa, conv::Conv};
 
-use super::{Conv2d, Grads, Layer, Pair};
+use super::{Conv2d, Grads, Layer, Pair, Prepared};
 
 /// An activation that never falls, so that the largest of a window stays the largest.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -53,19 +53,6 @@ impl PooledConv {
         (map + self.output_len() + self.kernel().scratch_len()).max(n * self.output_len())
     }
 
-    /// Evaluation: overwrites `y`.
-    pub fn infer(&self, params: &[f32], n: usize, x: &[f32], y: &mut [f32], scratch: &mut [f32]) {
-        let (weight, bias) = self.conv.split(params);
-        let (map, scratch) = scratch.split_at_mut(self.pool.c * self.pool.h * self.pool.w);
-        let (pooled, scratch) = scratch.split_at_mut(self.output_len());
-        let images = x.chunks_exact(self.conv.input().len()).zip(y.chunks_exact_mut(self.output_len()));
-        for (x, y) in images.take(n) {
-            self.kernel().forward(1, x, weight, bias, map, scratch);
-            pool::max_forward(self.isa, &self.pool, 1, map, pooled);
-            self.activate(pooled, y);
-        }
-    }
-
     fn activate(&self, x: &[f32], y: &mut [f32]) {
         match self.activation {
             Rising::Relu => activation::relu_forward(self.isa, x, y),
@@ -102,6 +89,28 @@ impl PooledConv {
         self.kernel().sparse_backward_weight(n, x, starts, dz, dweight, dbias);
         if let Some(dx) = dx {
             self.kernel().sparse_backward_input(n, starts, dz, self.conv.split(params).0, dx);
+        }
+    }
+}
+
+/// Evaluation: the weights are those of the convolution.
+impl Prepared for PooledConv {
+    fn prepared_len(&self) -> usize {
+        self.conv.prepared_len()
+    }
+
+    fn prepare(&self, params: &[f32], prepared: &mut [f32]) {
+        self.conv.prepare(params, prepared);
+    }
+
+    fn infer_prepared(&self, prepared: &[f32], n: usize, x: &[f32], y: &mut [f32], scratch: &mut [f32]) {
+        let (map, scratch) = scratch.split_at_mut(self.pool.c * self.pool.h * self.pool.w);
+        let (pooled, scratch) = scratch.split_at_mut(self.output_len());
+        let images = x.chunks_exact(self.conv.input().len()).zip(y.chunks_exact_mut(self.output_len()));
+        for (x, y) in images.take(n) {
+            self.conv.infer_prepared(prepared, 1, x, map, scratch);
+            pool::max_forward(self.isa, &self.pool, 1, map, pooled);
+            self.activate(pooled, y);
         }
     }
 }

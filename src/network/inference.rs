@@ -8,6 +8,7 @@ use rayon::prelude::*;
 use super::stages::{Kind, Stage, stages};
 use super::{LayerSpec, Network, Parameters};
 use crate::error::{Error, Result};
+use crate::layers::Prepared;
 use crate::tensor::Shape;
 
 /// Images that a worker takes through the dense layers at a time.
@@ -24,6 +25,7 @@ pub struct InferencePlan {
     maps: usize,
     /// What [`prepare`](InferencePlan::prepare) made of the parameters of each stage; empty where there is nothing to.
     prepared: Vec<Vec<f32>>,
+    is_prepared: bool,
     workers: Vec<Worker>,
     capacity: usize,
 }
@@ -60,6 +62,7 @@ impl InferencePlan {
         let prepared_len = |stage: &Stage| stage.prepared(network).map_or(0, |prepared| prepared.prepared_len());
         InferencePlan {
             prepared: stages.iter().map(|stage| vec![0.0; prepared_len(stage)]).collect(),
+            is_prepared: false,
             workers: (0..capacity.div_ceil(group)).map(|_| worker()).collect(),
             stages,
             maps,
@@ -86,14 +89,16 @@ impl InferencePlan {
                 prepared.prepare(&parameters.values[stage.params(network)], to);
             }
         }
+        self.is_prepared = true;
     }
 
     /// As [`run`](InferencePlan::run), with the parameters that [`prepare`](InferencePlan::prepare) has last been given.
     ///
     /// # Panics
     ///
-    /// As [`run`](InferencePlan::run).
+    /// As [`run`](InferencePlan::run), and if [`prepare`](InferencePlan::prepare) has not been called: all weights would be 0.
     pub fn run_prepared(&mut self, network: &Network, parameters: &Parameters, x: &[f32], y: &mut [f32]) {
+        assert!(self.is_prepared, "run_prepared before prepare");
         let (input, output) = (network.input().len(), network.output().len());
         let n = x.len() / input;
         assert!(n <= self.capacity, "a batch of {n} images in a plan for {}", self.capacity);
@@ -166,11 +171,13 @@ impl Run<'_> {
         let first = &self.network.layers()[stage.layers.start];
         let params = &self.parameters.values[stage.params(self.network)];
         let statistics = &self.parameters.statistics[first.statistics.clone()];
-        match (&stage.kind, stage.prepared(self.network)) {
-            (Kind::Layer, Some(layer)) => layer.infer_prepared(&self.prepared[index], n, x, y, scratch),
-            (Kind::Layer, None) => first.layer.infer(params, statistics, n, x, y, scratch),
-            (Kind::NormRectify(fused), _) => fused.infer(params, statistics, n, x, y, scratch),
-            (Kind::PooledConv(fused), _) => fused.infer(params, n, x, y, scratch),
+        match &stage.kind {
+            Kind::Layer => match first.layer.prepared() {
+                Some(layer) => layer.infer_prepared(&self.prepared[index], n, x, y, scratch),
+                None => first.layer.infer(params, statistics, n, x, y, scratch),
+            },
+            Kind::NormRectify(fused) => fused.infer(params, statistics, n, x, y, scratch),
+            Kind::PooledConv(fused) => fused.infer_prepared(&self.prepared[index], n, x, y, scratch),
         }
     }
 }
@@ -196,5 +203,66 @@ impl Network {
         let y_slice = y.as_slice_mut().expect("a fresh array is contiguous");
         InferencePlan::new(self, n).run(self, parameters, x, y_slice);
         Ok(y)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use steersman_kernels::Isa;
+
+    use super::super::NamedLayer;
+    use super::*;
+
+    #[derive(serde::Deserialize)]
+    struct Layers {
+        layers: Vec<LayerSpec>,
+    }
+
+    fn network(layers: &str, isa: Isa) -> Network {
+        let specs = toml::from_str::<Layers>(&format!("layers = [{layers}]")).unwrap().layers;
+        Network::new(Shape::new(2, 21, 19), &specs, isa).unwrap()
+    }
+
+    #[test]
+    #[should_panic(expected = "run_prepared before prepare")]
+    fn a_plan_without_weights_does_not_run() {
+        let network = network("{ kind = 'dense', units = 1 }", Isa::PORTABLE);
+        let parameters = network.initialize(1);
+        let x = vec![0.0; network.input().len()];
+        InferencePlan::new(&network, 1).run_prepared(&network, &parameters, &x, &mut [0.0]);
+    }
+
+    /// Convolution, activation and pooling as one, with weights that are prepared once: the bits of layer by layer.
+    #[test]
+    fn prepared_weights_of_a_pooled_convolution_change_no_bit() {
+        let conv = "{ kind = 'conv2d', filters = 5, kernel = [3, 3] }";
+        for activation in ["relu", "elu"] {
+            let layers = format!(
+                "{conv}, {{ kind = '{activation}' }}, {{ kind = 'max_pool', window = [4, 4] }}, {{ kind = 'dense', units = 1 }}"
+            );
+            for isa in Isa::available() {
+                let network = network(&layers, isa);
+                let parameters = network.initialize(2);
+                let mut plan = InferencePlan::new(&network, 3);
+                assert!(matches!(plan.stages[0].kind, Kind::PooledConv(_)));
+                plan.prepare(&network, &parameters);
+                let len = network.input().len();
+                for seed in 0..3 {
+                    let x: Vec<f32> = (0..3 * len).map(|i| ((i * 37 + seed * 11) % 101) as f32 / 50.0 - 1.0).collect();
+                    let mut y = [0.0; 3];
+                    plan.run_prepared(&network, &parameters, &x, &mut y);
+                    for (x, y) in x.chunks_exact(len).zip(y) {
+                        let mut maps = x.to_vec();
+                        for NamedLayer { layer, params, .. } in network.layers() {
+                            let mut next = vec![0.0; layer.output().len()];
+                            let mut scratch = vec![0.0; layer.scratch_len(1)];
+                            layer.infer(&parameters.values[params.clone()], &[], 1, &maps, &mut next, &mut scratch);
+                            maps = next;
+                        }
+                        assert_eq!(maps[0].to_bits(), y.to_bits(), "{activation} on {}", isa.name());
+                    }
+                }
+            }
+        }
     }
 }

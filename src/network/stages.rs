@@ -74,10 +74,11 @@ impl Stage {
     }
 
     /// Evaluation with prepared parameters, if it has that.
-    pub fn prepared<'a>(&self, network: &'a Network) -> Option<&'a dyn Prepared> {
-        match self.kind {
+    pub fn prepared<'a>(&'a self, network: &'a Network) -> Option<&'a dyn Prepared> {
+        match &self.kind {
             Kind::Layer => network.layers()[self.layers.start].layer.prepared(),
-            Kind::NormRectify(_) | Kind::PooledConv(_) => None,
+            Kind::NormRectify(_) => None,
+            Kind::PooledConv(fused) => Some(&**fused),
         }
     }
 
@@ -191,6 +192,7 @@ mod tests {
         let mut parameters = network.initialize(1);
         // Off their first values, so that slopes are not 0 and scales not 1.
         parameters.values.iter_mut().zip(draw(network.count(true))).for_each(|(p, d)| *p += 0.2 * d);
+        parameters.statistics.iter_mut().zip(draw(network.count(false))).for_each(|(p, d)| *p += 0.2 * d);
         let mut plan = TrainingPlan::with_stages(network, images, stages);
         let input = StepInput { x: &x, labels: &labels, seed: 1, step: 0 };
         let loss = plan.step(network, &mut parameters, &Loss::default(), input);
@@ -229,24 +231,37 @@ mod tests {
         for (fused, layers) in cases {
             let specs = toml::from_str::<Layers>(&format!("layers = [{layers}]")).unwrap().layers;
             for isa in Isa::available() {
-                let network = Network::new(Shape::new(2, 29, 31), &specs, isa).unwrap();
-                let stages = stages(&network);
-                assert_eq!(stages.iter().filter(|stage| stage.layers.len() > 1).count(), fused, "{layers}");
-                let (loss, gradient, parameters) = step(&network, stages, 19);
-                let (plain_loss, plain_gradient, plain_parameters) = step(&network, layer_by_layer(&network), 19);
-                approx::assert_relative_eq!(loss, plain_loss, max_relative = 1e-5);
-                let squares = |range: Range<usize>| plain_gradient[range].iter().map(|g| g * g).sum::<f32>();
-                for tensor in network.tensors().iter().filter(|tensor| tensor.trainable) {
-                    let pairs = gradient[tensor.range.clone()].iter().zip(&plain_gradient[tensor.range.clone()]);
-                    let distance: f32 = pairs.map(|(a, b)| (a - b).powi(2)).sum();
-                    // Batch norm takes the mean away, so a bias before it has no gradient but rounding.
-                    let size = squares(tensor.range.clone()).max(1e-6 * squares(0..plain_gradient.len()));
-                    let error = (distance / size).sqrt();
-                    assert!(error < 2e-4, "{}: {error:e} in {layers} on {}", tensor.name, isa.name());
+                let fresh = || Network::new(Shape::new(2, 29, 31), &specs, isa).unwrap();
+                let network = fresh();
+                assert_eq!(stages(&network).iter().filter(|stage| stage.layers.len() > 1).count(), fused, "{layers}");
+                agrees(&network, &format!("{layers} on {}", isa.name()));
+                for frozen in [&["conv1"][..], &["bn1"], &["conv1", "bn1"], &["conv2"]] {
+                    let names: Vec<String> = frozen.iter().map(|name| name.to_string()).collect();
+                    let mut network = fresh();
+                    if names.iter().all(|name| network.layers().iter().any(|layer| layer.name == *name)) {
+                        network.freeze(&names).unwrap();
+                        agrees(&network, &format!("{layers} with {frozen:?} frozen on {}", isa.name()));
+                    }
                 }
-                let statistics = parameters.statistics.iter().zip(&plain_parameters.statistics);
-                statistics.for_each(|(a, b)| approx::assert_relative_eq!(*a, *b, max_relative = 1e-5, epsilon = 1e-6));
             }
         }
+    }
+
+    /// The stages of `network` make the same step as its layers one by one.
+    fn agrees(network: &Network, what: &str) {
+        let (loss, gradient, parameters) = step(network, stages(network), 19);
+        let (plain_loss, plain_gradient, plain_parameters) = step(network, layer_by_layer(network), 19);
+        approx::assert_relative_eq!(loss, plain_loss, max_relative = 1e-5);
+        let squares = |range: Range<usize>| plain_gradient[range].iter().map(|g| g * g).sum::<f32>();
+        for tensor in network.tensors().iter().filter(|tensor| tensor.trainable && !tensor.frozen) {
+            let pairs = gradient[tensor.range.clone()].iter().zip(&plain_gradient[tensor.range.clone()]);
+            let distance: f32 = pairs.map(|(a, b)| (a - b).powi(2)).sum();
+            // Batch norm takes the mean away, so a bias before it has no gradient but rounding.
+            let size = squares(tensor.range.clone()).max(1e-6 * squares(0..plain_gradient.len()));
+            let error = (distance / size).sqrt();
+            assert!(error < 2e-4, "{}: {error:e} in {what}", tensor.name);
+        }
+        let statistics = parameters.statistics.iter().zip(&plain_parameters.statistics);
+        statistics.for_each(|(a, b)| approx::assert_relative_eq!(*a, *b, max_relative = 1e-5, epsilon = 1e-6));
     }
 }

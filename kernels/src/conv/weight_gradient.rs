@@ -13,17 +13,20 @@ const TILE_TAPS: usize = 3;
 /// Vectors of positions that are packed at a time: 32 x 8 channels x 64 bytes, or 64 x 4 x 32, are at most half of a
 /// 32 KiB cache.
 const MOST_CHUNK: usize = 64;
+const CHUNK_OF_MANY_REGISTERS: usize = 32;
 
 const fn chunk_vectors<S: Simd>() -> usize {
-    if S::MANY_REGISTERS { 32 } else { MOST_CHUNK }
+    if S::MANY_REGISTERS { CHUNK_OF_MANY_REGISTERS } else { MOST_CHUNK }
 }
 /// The most lanes and channels a tile has on any instruction set.
 const MOST_LANES: usize = 16;
 const MOST_CHANNELS: usize = 8;
+/// The most vectors of a packed chunk: 32 of 8 channels; 64 of 4, where there are 16 registers, are as many.
+const MOST_PACKED: usize = CHUNK_OF_MANY_REGISTERS * MOST_CHANNELS;
 
 /// Elements of scratch for `taps` taps.
 pub(crate) fn scratch_len(taps: usize) -> usize {
-    (32 * MOST_CHANNELS + taps.next_multiple_of(TILE_TAPS) * MOST_CHANNELS) * MOST_LANES + ALIGNMENT
+    (MOST_PACKED + taps.next_multiple_of(TILE_TAPS) * MOST_CHANNELS) * MOST_LANES + ALIGNMENT
 }
 
 /// Adds the gradient of the images in `dy` to `dweight` and `dbias`.
@@ -65,11 +68,15 @@ fn run_height<S: Simd, const MR: usize>(
     let images = dy.len() / image_len;
     sum.check::<S>(images, x.len(), dy.len());
     assert!(dweight.len() == sum.channels * taps && dbias.len() == sum.channels, "weight gradient: wrong length");
+    debug_assert!(chunk_vectors::<S>() * MR <= MOST_PACKED && MR <= MOST_CHANNELS && S::LANES <= MOST_LANES);
+    let total = images * sum.spans.len();
+    if total == 0 {
+        return;
+    }
     let (packed, sums) = align(scratch).split_at_mut(chunk_vectors::<S>() * MR * S::LANES);
     // A row of vectors, one for each tap, for each channel.
     let row = taps.next_multiple_of(TILE_TAPS);
     let sums = &mut sums[..MR * row * S::LANES];
-    let total = images * sum.spans.len();
     let farthest = sum.farthest();
 
     for first in (0..sum.channels).step_by(MR) {

@@ -5,16 +5,19 @@
 
 use steersman_kernels::Isa;
 
-use super::Problem;
 use super::architecture::KerasLayer;
 use super::file::Tensor;
 use super::translate::{AxisOrder, KernelLayout, Operation, Step};
+use super::{Problem, check_size, shown};
 use crate::layers::Slopes;
 use crate::network::{LayerSpec, Parameters};
 use crate::tensor::{Initializer, Shape};
 
 /// Most numbers of an imported network: 256 MiB.
 const MAX_NUMBERS: usize = 1 << 26;
+
+/// Most slopes that are shared in the file and have to be repeated here: 16 MiB.
+const MAX_REPEATED: usize = 1 << 22;
 
 /// The result.
 pub(super) struct Assembly {
@@ -48,6 +51,7 @@ pub(super) fn assemble(
         shape: context.input,
         is_flat: false,
         interleaved: None,
+        repeated: 0,
         specs: Vec::new(),
         parameters: Parameters { values: Vec::new(), statistics: Vec::new() },
     };
@@ -67,6 +71,8 @@ struct Assembler<'a> {
     is_flat: bool,
     /// The map whose numbers the vector has, in the order height, width, channel.
     interleaved: Option<Shape>,
+    /// How many slopes have been repeated so far.
+    repeated: usize,
     specs: Vec<LayerSpec>,
     parameters: Parameters,
 }
@@ -108,6 +114,7 @@ impl Assembler<'_> {
         if self.parameters.values.len() + values.len() > MAX_NUMBERS {
             return Err(format!("the network would have more than {MAX_NUMBERS} parameters"));
         }
+        check_size(layer.output())?;
         self.parameters.values.extend(values);
         self.parameters.statistics.extend(statistics);
         self.shape = layer.output();
@@ -124,13 +131,12 @@ impl Assembler<'_> {
         let LayerSpec::Conv2d { filters: oc, kernel: [kh, kw], .. } = *spec else {
             unreachable!("a convolution is translated into one");
         };
-        // Checks the sizes before anything is read.
-        spec.build(self.shape, Isa::PORTABLE)?;
         let ic = self.shape.c;
         let kernel_shape = match layout {
             KernelLayout::HeightWidthInOut => [kh, kw, ic, oc],
             KernelLayout::OutInHeightWidth => [oc, ic, kh, kw],
         };
+        // Before the layer is built: the file has as many numbers then, and tables of a kernel's size are no larger than it.
         let mut read = expect(tensors, &[Some(&kernel_shape), bias.then_some(&[oc])])?.into_iter();
         let (kernel, bias) = (read.next().flatten().unwrap_or_default(), read.next().flatten());
         let mut values = Vec::with_capacity(kernel.len() + oc);
@@ -224,30 +230,49 @@ impl Assembler<'_> {
         if !fits {
             return Err(unfitting(&tensor.name, &found, &full));
         }
-        if c * h * w > MAX_NUMBERS {
-            return Err(format!("would have more than {MAX_NUMBERS} slopes"));
-        }
         let slopes = tensor.read()?;
-        // Index of the slope at a channel, row and column; an axis of length 1 is shared.
-        let slope = |[c, y, x]: [usize; 3]| {
-            let place = match (self.is_flat, self.context.order) {
-                (true, _) => vec![c],
-                (false, AxisOrder::ChannelsLast) => vec![y, x, c],
-                (false, AxisOrder::ChannelsFirst) => vec![c, y, x],
-            };
-            let steps = found.iter().zip(place);
-            slopes[steps.fold(0, |index, (extent, place)| index * extent + if *extent == 1 { 0 } else { place })]
-        };
-        let per_channel = !self.is_flat && found.iter().product::<usize>() == c && slopes.len() == c && h * w > 1;
-        if per_channel && found[if self.context.order == AxisOrder::ChannelsLast { 2 } else { 0 }] == c {
+        let [_, rows, columns] = self.extents(&found);
+        let shared_by_positions = !self.is_flat && h * w > 1 && rows == 1 && columns == 1;
+        let count = if shared_by_positions { c } else { c * h * w };
+        if slopes.len() < count {
+            self.repeated += count;
+            if self.repeated > MAX_REPEATED {
+                return Err(format!("its {} shared slopes stand for {count}, which is too many", slopes.len()));
+            }
+        }
+        if shared_by_positions {
+            let values = if slopes.len() == c { slopes } else { vec![slopes[0]; c] };
             let spec = LayerSpec::PRelu { slopes: Slopes::PerChannel, initial_slope: 0.0 };
-            return self.push(spec, slopes, Vec::new());
+            return self.push(spec, values, Vec::new());
         }
         let values = match self.interleaved {
-            Some(map) if found[0] == c => interleaved_places(map).into_iter().map(|place| slopes[place]).collect(),
-            _ => (0..c * h * w).map(|i| slope([i / (h * w), i / w % h, i % w])).collect(),
+            Some(map) if slopes.len() == c => interleaved_places(map).into_iter().map(|place| slopes[place]).collect(),
+            _ => {
+                let [of_channel, of_row, of_column] = self.strides(&found);
+                let place = |i: usize| i / (h * w) * of_channel + i / w % h * of_row + i % w * of_column;
+                (0..count).map(|i| slopes[place(i)]).collect()
+            }
         };
         self.push(LayerSpec::PRelu { slopes: Slopes::PerPosition, initial_slope: 0.0 }, values, Vec::new())
+    }
+
+    /// `found`, extents in the order of the file, as those of channels, rows and columns.
+    fn extents(&self, found: &[usize]) -> [usize; 3] {
+        match (found, self.context.order) {
+            (&[h, w, c], AxisOrder::ChannelsLast) => [c, h, w],
+            (&[c, h, w], AxisOrder::ChannelsFirst) => [c, h, w],
+            _ => [found[0], 1, 1],
+        }
+    }
+
+    /// How far apart neighbours along channels, rows and columns lie in a tensor of extents `found`; 0 along a shared axis.
+    fn strides(&self, found: &[usize]) -> [usize; 3] {
+        let [c, h, w] = self.extents(found);
+        let steps = match self.context.order {
+            AxisOrder::ChannelsLast => [1, w * c, c],
+            AxisOrder::ChannelsFirst => [h * w, w, 1],
+        };
+        std::array::from_fn(|axis| if [c, h, w][axis] == 1 { 0 } else { steps[axis] })
     }
 
     fn pool(&mut self, max: bool, window: [usize; 2], stride: [usize; 2], same: bool) -> Result<(), String> {
@@ -306,5 +331,6 @@ fn expect(tensors: &[Tensor], shapes: &[Option<&[usize]>]) -> Result<Vec<Option<
 }
 
 fn unfitting(name: &str, found: &[usize], expected: &[usize]) -> String {
+    let name = shown(name);
     format!("tensor `{name}` has shape {found:?}; the architecture says {expected:?}")
 }

@@ -8,8 +8,10 @@ use std::io::{Cursor, Read};
 use std::path::Path;
 
 use hdf5_reader::{Attribute, Dataset, Hdf5File, OpenOptions, group::Group};
+use serde::Deserialize;
 
 use super::architecture::KerasLayer;
+use super::{MAX_JSON_BYTES, shown, shown_list};
 use crate::error::{Error, Result};
 
 /// Larger files are refused: networks that steer have megabytes.
@@ -17,9 +19,6 @@ const MAX_FILE_BYTES: u64 = 1 << 30;
 
 /// How many times longer than the file its unpacked content may be. Weights hardly shrink.
 const INFLATION: usize = 16;
-
-/// Characters of a tensor's name that messages show.
-const MAX_NAME: usize = 100;
 
 /// An opened file.
 pub(super) struct KerasFile {
@@ -52,24 +51,24 @@ impl KerasFile {
         let limit = inflated(bytes.len());
         let mut archive =
             zip::ZipArchive::new(Cursor::new(bytes)).map_err(|e| format!("is no zip archive, or is damaged: {e}"))?;
-        let mut entry = |name: &str| -> Result<Vec<u8>, String> {
+        let mut entry = |name: &str, limit: usize| -> Result<Vec<u8>, String> {
             let file = archive.by_name(name).map_err(|e| format!("has no `{name}`: {e}"))?;
             let mut content = Vec::new();
             let read = file.take(limit as u64 + 1).read_to_end(&mut content);
             read.map_err(|e| format!("`{name}` is damaged: {e}"))?;
             match content.len() > limit {
-                true => Err(format!("`{name}` unpacks to more than {INFLATION} times the file")),
+                true => Err(format!("`{name}` unpacks to more than {limit} bytes, which is too long for it")),
                 false => Ok(content),
             }
         };
         let text = |bytes: Vec<u8>, name: &str| String::from_utf8(bytes).map_err(|_| format!("`{name}` is no text"));
-        let architecture = text(entry("config.json")?, "config.json")?;
-        let metadata = entry("metadata.json").ok().and_then(|bytes| serde_json::from_slice(&bytes).ok());
-        let metadata: serde_json::Value = metadata.unwrap_or_default();
-        let file = open_hdf5(entry("model.weights.h5")?)?;
+        let architecture = text(entry("config.json", MAX_JSON_BYTES)?, "config.json")?;
+        let metadata = entry("metadata.json", MAX_JSON_BYTES).ok();
+        let metadata = metadata.and_then(|bytes| serde_json::from_slice::<Metadata>(&bytes).ok());
+        let file = open_hdf5(entry("model.weights.h5", limit)?)?;
         Ok(KerasFile {
             architecture: Some(architecture),
-            keras_version: metadata["keras_version"].as_str().map(String::from),
+            keras_version: metadata.and_then(|metadata| metadata.keras_version).map(|version| shown(&version)),
             backend: None,
             weights: Weights::find(&root(&file)?)?,
         })
@@ -80,17 +79,33 @@ impl KerasFile {
         let text = |name: &str| strings(&root, name).ok().and_then(|mut all| all.pop());
         let weights = Weights::find(&root)?;
         let beside_weights = |name: &str| strings(&weights.group, name).ok().and_then(|mut all| all.pop());
+        let architecture = text("model_config");
+        if let Some(len) = architecture.as_ref().map(String::len).filter(|len| *len > MAX_JSON_BYTES) {
+            return Err(format!("its architecture has {len} bytes; more than {MAX_JSON_BYTES} are not read"));
+        }
+        let keras_version = text("keras_version").or_else(|| beside_weights("keras_version"));
         Ok(KerasFile {
-            architecture: text("model_config"),
-            keras_version: text("keras_version").or_else(|| beside_weights("keras_version")),
+            architecture,
+            keras_version: keras_version.map(|version| shown(&version)),
             backend: text("backend").or_else(|| beside_weights("backend")),
             weights,
         })
     }
 }
 
+/// What of `metadata.json` matters here; the rest is not kept.
+#[derive(Deserialize)]
+struct Metadata {
+    keras_version: Option<String>,
+}
+
 fn inflated(len: usize) -> usize {
     len.saturating_mul(INFLATION)
+}
+
+/// A reader's error, which may repeat what it found in the file.
+fn said(error: impl std::fmt::Display) -> String {
+    shown(&error.to_string())
 }
 
 fn open_hdf5(bytes: Vec<u8>) -> Result<Hdf5File, String> {
@@ -101,17 +116,18 @@ fn open_hdf5(bytes: Vec<u8>) -> Result<Hdf5File, String> {
         .with_max_object_header_bytes(len)
         .with_chunk_cache_bytes(0);
     let neither = "is neither an HDF5 file nor the zip archive of Keras 3, or is damaged";
-    Hdf5File::from_vec_with_options(bytes, options).map_err(|e| format!("{neither}: {e}"))
+    Hdf5File::from_vec_with_options(bytes, options).map_err(|e| format!("{neither}: {}", said(e)))
 }
 
 fn root(file: &Hdf5File) -> Result<Group, String> {
-    file.root_group().map_err(|e| format!("is damaged: {e}"))
+    file.root_group().map_err(|e| format!("is damaged: {}", said(e)))
 }
 
 /// The strings of attribute `name`; of `name0`, `name1`, … where Keras had to split a long list.
 fn strings(group: &Group, name: &str) -> Result<Vec<String>, String> {
-    let attributes =
-        group.attributes().map_err(|e| format!("the attributes of `{}` are damaged: {e}", group.name()))?;
+    let attributes = group
+        .attributes()
+        .map_err(|e| format!("the attributes of `{}` are damaged: {}", shown(group.name()), said(e)))?;
     let find = |name: &str| attributes.iter().find(|attribute| attribute.name == name);
     if let Some(attribute) = find(name) {
         return list(attribute);
@@ -120,7 +136,7 @@ fn strings(group: &Group, name: &str) -> Result<Vec<String>, String> {
     for part in 0.. {
         match find(&format!("{name}{part}")) {
             Some(attribute) => all.extend(list(attribute)?),
-            None if part == 0 => return Err(format!("`{}` has no attribute `{name}`", group.name())),
+            None if part == 0 => return Err(format!("`{}` has no attribute `{name}`", shown(group.name()))),
             None => break,
         }
     }
@@ -132,7 +148,9 @@ fn list(attribute: &Attribute) -> Result<Vec<String>, String> {
     if attribute.shape.contains(&0) {
         return Ok(Vec::new());
     }
-    attribute.read_strings().map_err(|e| format!("attribute `{}` is no list of names: {e}", attribute.name))
+    attribute
+        .read_strings()
+        .map_err(|e| format!("attribute `{}` is no list of names: {}", shown(&attribute.name), said(e)))
 }
 
 /// The tensors of a file, by layer.
@@ -160,7 +178,9 @@ impl Weights {
         if let Ok(names) = strings(&group, "layer_names") {
             let mut layers = Vec::new();
             for name in names {
-                let layer = group.group(&name).map_err(|e| format!("layer `{name}` has no group of weights: {e}"))?;
+                let layer = group.group(&name);
+                let layer =
+                    layer.map_err(|e| format!("layer `{}` has no group of weights: {}", shown(&name), said(e)))?;
                 if !strings(&layer, "weight_names").unwrap_or_default().is_empty() {
                     layers.push((name, layer));
                 }
@@ -171,7 +191,7 @@ impl Weights {
         let container =
             container.map_err(|_| "has no weights: neither `layer_names` nor a group `layers`".to_string())?;
         let (mut layers, mut by_class) = (Vec::new(), false);
-        for layer in container.groups().map_err(|e| format!("the list of layers is damaged: {e}"))? {
+        for layer in container.groups().map_err(|e| format!("the list of layers is damaged: {}", said(e)))? {
             let Ok(tensors) = layer.group("vars") else { continue };
             let name = strings(&tensors, "name").ok().and_then(|mut names| names.pop());
             by_class |= name.is_none();
@@ -199,10 +219,10 @@ impl Weights {
         if let Some(missing) = wanted().find(|key| !by_name.contains_key(key)) {
             let count = wanted().count();
             if self.kind != Kind::Listed || count != self.layers.len() {
-                let names: Vec<&str> = self.layers.iter().map(|(name, _)| name.as_str()).collect();
                 return Err(format!(
-                    "has no weights for layer `{missing}`; it has them for {}: do architecture and weights belong together?",
-                    names.join(", ")
+                    "has no weights for layer `{}`; it has them for {}: do architecture and weights belong together?",
+                    shown(missing),
+                    shown_list(self.layers.iter().map(|(name, _)| name.as_str()))
                 ));
             }
             in_order.extend(self.layers.iter().map(|(_, group)| group));
@@ -225,23 +245,23 @@ impl Weights {
                 let last = parts.pop().unwrap_or_default();
                 let dataset = parts.iter().try_fold(layer.clone(), |group, part| group.group(part));
                 let dataset = dataset.and_then(|group| group.dataset(last));
-                // A hostile name is as long as an attribute; messages are not.
-                let name: String = name.chars().take(MAX_NAME).collect();
-                let dataset = dataset.map_err(|e| format!("tensor `{name}` of `{}`: {e}", layer.name()))?;
+                let name = shown(&name);
+                let dataset =
+                    dataset.map_err(|e| format!("tensor `{name}` of `{}`: {}", shown(layer.name()), said(e)))?;
                 Ok(Tensor { name, dataset })
             };
             return strings(layer, "weight_names")?.into_iter().map(open).collect();
         }
-        let damaged = |e| format!("the tensors of a layer are damaged: {e}");
+        let damaged = |e| format!("the tensors of a layer are damaged: {}", said(e));
         let mut datasets = layer.datasets().map_err(damaged)?;
         datasets.sort_by_key(|dataset| dataset.name().parse::<u64>().unwrap_or(u64::MAX));
-        Ok(datasets.into_iter().map(|dataset| Tensor { name: dataset.name().into(), dataset }).collect())
+        Ok(datasets.into_iter().map(|dataset| Tensor { name: shown(dataset.name()), dataset }).collect())
     }
 }
 
 /// One tensor of a layer; its numbers are read when its shape has been found right.
 pub(super) struct Tensor {
-    /// Its name in the file.
+    /// Its name in the file, as messages show it.
     pub name: String,
     dataset: Dataset,
 }
@@ -259,7 +279,7 @@ impl Tensor {
             let wide = self.dataset.read_array::<f64>();
             wide.map(|array| array.into_iter().map(|value| value as f32).collect()).map_err(|_| first)
         });
-        let values = values.map_err(|e| format!("tensor `{}`: {e}", self.name))?;
+        let values = values.map_err(|e| format!("tensor `{}`: {}", self.name, said(e)))?;
         match values.iter().position(|value| !value.is_finite()) {
             Some(place) => Err(format!("tensor `{}` has {} at place {place}", self.name, values[place])),
             None => Ok(values),

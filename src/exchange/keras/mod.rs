@@ -63,22 +63,31 @@ pub struct Imported {
 }
 
 impl Imported {
+    /// Whether `preprocessing` gives what the network takes.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Usage`] if it gives another shape.
+    pub fn check_input(&self, preprocessing: &Preprocessing) -> Result<()> {
+        let [c, h, w] = preprocessing.output();
+        let Shape { c: planes, h: rows, w: columns } = self.input;
+        if [c, h, w] == [planes, rows, columns] {
+            return Ok(());
+        }
+        Err(Error::Usage(format!(
+            "the network takes images of {rows}x{columns} with {planes} colour planes, the preprocessing gives {h}x{w} \
+             with {c}: set its resize and colour accordingly"
+        )))
+    }
+
     /// The model called `name` that sees images through `preprocessing`. Its recipe has Adam at a small rate, for training it
     /// further.
     ///
     /// # Errors
     ///
-    /// [`Error::Usage`] if `preprocessing` gives another shape than the network takes; [`Error::Recipe`] and
-    /// [`Error::Network`] if the network gives more than one number.
+    /// [`Error::Usage`] as [`check_input`](Imported::check_input); [`Error::Recipe`] if the numbers do not go into a recipe.
     pub fn into_model(self, name: &str, preprocessing: Preprocessing) -> Result<Model> {
-        let [c, h, w] = preprocessing.output();
-        if Shape::new(c, h, w) != self.input {
-            let Shape { c: planes, h: rows, w: columns } = self.input;
-            return Err(Error::Usage(format!(
-                "the network takes images of {rows}x{columns} with {planes} colour planes, the preprocessing gives {h}x{w} \
-                 with {c}: set its resize and colour accordingly"
-            )));
-        }
+        self.check_input(&preprocessing)?;
         let version = self.keras_version.map_or(String::new(), |version| format!(" {version}"));
         let table = |e: toml::ser::Error| Error::Recipe { recipe: name.into(), message: e.to_string() };
         let optimizer = toml::toml! {
@@ -122,8 +131,8 @@ struct Problem {
 ///
 /// # Errors
 ///
-/// [`Error::Io`] if a file cannot be read; [`Error::Data`] if it is damaged, is no model of Keras, or has layers without a
-/// counterpart, all of which are listed with the reason.
+/// [`Error::Io`] if a file cannot be read; [`Error::Data`] if it is damaged, is no model of Keras, gives more than one number,
+/// or has layers without a counterpart, which are listed with the reason.
 pub fn import(path: &Path, options: &ImportOptions) -> Result<Imported> {
     let file = KerasFile::open(path)?;
     let wrong = |message: String| Error::data(path, message);
@@ -168,14 +177,19 @@ pub fn import(path: &Path, options: &ImportOptions) -> Result<Imported> {
     let assembly = assemble::assemble(&context, &chain.layers, &steps, &tensors).map_err(|p| wrong(listed(&[p])))?;
     let Assembly { specs, parameters, ends } = assembly;
     let network = Network::new(input, &specs, Isa::PORTABLE)?;
+    let outputs = network.output().len();
+    if outputs != 1 {
+        return Err(wrong(format!("gives {outputs} numbers for an image; a model here gives one, the steering")));
+    }
 
     let mut notices = Vec::new();
     let mut report = Vec::new();
     let mut start = 0;
     for ((layer, step), end) in chain.layers.iter().zip(&steps).zip(ends) {
         let becomes = network.layers()[start..end].iter().map(|layer| layer.name.clone()).collect();
-        report.push(LayerReport { layer: layer.name.clone(), class: layer.class.clone(), becomes });
-        notices.extend(step.notice.map(|notice| format!("{} ({}): {notice}", layer.name, layer.class)));
+        let (name, class) = (shown(&layer.name), shown(&layer.class));
+        notices.extend(step.notice.map(|notice| format!("{name} ({class}): {notice}")));
+        report.push(LayerReport { layer: name, class, becomes });
         start = end;
     }
     if order == AxisOrder::ChannelsFirst && file.backend.is_none() && !flip_kernels {
@@ -188,12 +202,51 @@ pub fn import(path: &Path, options: &ImportOptions) -> Result<Imported> {
     Ok(Imported { input, layers: specs, parameters, keras_version: file.keras_version, report, notices })
 }
 
-/// Architectures are kilobytes long.
-const MAX_ARCHITECTURE_BYTES: u64 = 64 << 20;
+/// Longer JSON is refused: architectures are kilobytes long, and parsed, each number of a hostile one takes 36 times its length.
+const MAX_JSON_BYTES: usize = 1 << 20;
+
+/// Highest number of rows and columns of a map, and of its numbers in all; their products stay far from overflowing.
+const MAX_SIDE: usize = 8192;
+const MAX_MAP: usize = 1 << 26;
+
+/// Whether maps of `shape` are small enough to be computed with.
+fn check_size(shape: Shape) -> Result<(), String> {
+    let Shape { c, h, w } = shape;
+    if h.max(w) > MAX_SIDE || c.saturating_mul(h).saturating_mul(w) > MAX_MAP {
+        return Err(format!(
+            "a map of {h}x{w}x{c} is too large: up to {MAX_SIDE} rows and columns and {MAX_MAP} numbers in all can be imported"
+        ));
+    }
+    Ok(())
+}
+
+/// Characters of a text from the file, and entries of a list of them, that messages show.
+const SHOWN_CHARS: usize = 100;
+const SHOWN_ENTRIES: usize = 20;
+
+/// A text from the file, fit for a message: short, and without characters that a terminal obeys.
+fn shown(text: &str) -> String {
+    let mut chars = text.chars().filter(|c| !c.is_control());
+    let mut short: String = chars.by_ref().take(SHOWN_CHARS).collect();
+    if chars.next().is_some() {
+        short.push('…');
+    }
+    short
+}
+
+/// Names from the file in one line.
+fn shown_list<'a>(names: impl ExactSizeIterator<Item = &'a str>) -> String {
+    let more = names.len().saturating_sub(SHOWN_ENTRIES);
+    let mut text = names.take(SHOWN_ENTRIES).map(shown).collect::<Vec<_>>().join(", ");
+    if more > 0 {
+        text += &format!(" and {more} more");
+    }
+    text
+}
 
 fn read_architecture(path: &Path) -> Result<String> {
     let len = std::fs::metadata(path).map_err(Error::io(path))?.len();
-    if len > MAX_ARCHITECTURE_BYTES {
+    if len > MAX_JSON_BYTES as u64 {
         return Err(Error::data(path, format!("has {len} bytes, which is no architecture")));
     }
     std::fs::read_to_string(path).map_err(Error::io(path))
@@ -204,8 +257,11 @@ fn listed(problems: &[Problem]) -> String {
         1 => "a layer cannot be imported:".to_string(),
         count => format!("{count} layers cannot be imported:"),
     };
-    for Problem { layer, class, reason } in problems {
-        text += &format!("\n  {layer} ({class}): {reason}");
+    for Problem { layer, class, reason } in problems.iter().take(SHOWN_ENTRIES) {
+        text += &format!("\n  {} ({}): {reason}", shown(layer), shown(class));
+    }
+    if let Some(more) = problems.len().checked_sub(SHOWN_ENTRIES).filter(|more| *more > 0) {
+        text += &format!("\n  and {more} more");
     }
     text
 }
@@ -226,14 +282,21 @@ fn axis_order(layers: &[architecture::KerasLayer], steps: &[Step], problems: &mu
 /// Shape of the input: what the file says, or else what the user's preprocessing gives.
 fn input_shape(steps: &[Step], order: AxisOrder, given: Option<Shape>) -> Result<Shape, String> {
     let said = steps.iter().find_map(|step| step.input.as_ref());
-    match said.map(Vec::as_slice) {
-        Some(&[a, b, c]) if a > 0 && b > 0 && c > 0 => Ok(match order {
+    let shape = match said.map(Vec::as_slice) {
+        Some(&[a, b, c]) if a > 0 && b > 0 && c > 0 => match order {
             AxisOrder::ChannelsLast => Shape::new(c, a, b),
             AxisOrder::ChannelsFirst => Shape::new(a, b, c),
-        }),
-        Some(extents) if extents.len() != 3 => Err(format!("its input has the shape {extents:?}, which is no image")),
-        _ => given.ok_or_else(|| {
-            "does not say how large its input is: give the preprocessing, whose size it then is, with --preprocessing".into()
-        }),
-    }
+        },
+        Some(extents) if extents.len() != 3 => {
+            let axes = extents.len();
+            return Err(format!(
+                "its input has {axes} axes, which is no image: an image has height, width and colours"
+            ));
+        }
+        _ => given.ok_or(
+            "does not say how large its input is: give the preprocessing, whose size it then is, with --preprocessing",
+        )?,
+    };
+    check_size(shape).map_err(|message| format!("its input: {message}"))?;
+    Ok(shape)
 }

@@ -4,6 +4,7 @@ use serde_json::{Map, Value};
 
 use super::architecture::KerasLayer;
 use super::lambda::{self, Affine};
+use super::shown;
 use crate::layers::Padding;
 use crate::network::LayerSpec;
 use crate::tensor::Initializer;
@@ -302,7 +303,9 @@ impl<'a> Options<'a> {
         match self.find(&["padding", "border_mode"]).map(|(_, value)| value.as_str()) {
             None | Some(Some("valid")) => Ok(false),
             Some(Some("same")) => Ok(true),
-            Some(other) => Err(format!("padding `{}` has no counterpart", other.unwrap_or("of an unknown kind"))),
+            Some(other) => {
+                Err(format!("padding `{}` has no counterpart", shown(other.unwrap_or("of an unknown kind"))))
+            }
         }
     }
 
@@ -321,7 +324,7 @@ impl<'a> Options<'a> {
             None | Some(Some("default")) => Ok(None),
             Some(Some("channels_last" | "tf")) => Ok(Some(AxisOrder::ChannelsLast)),
             Some(Some("channels_first" | "th")) => Ok(Some(AxisOrder::ChannelsFirst)),
-            Some(other) => Err(format!("order of axes `{}` is unknown", other.unwrap_or("of an unknown kind"))),
+            Some(other) => Err(format!("order of axes `{}` is unknown", shown(other.unwrap_or("of an unknown kind")))),
         }
     }
 
@@ -349,7 +352,7 @@ fn activation(value: &Value) -> Result<Option<LayerSpec>, String> {
                 Some(Value::String(name)) => name.as_str(),
                 Some(Value::Object(config)) => {
                     let found = pointwise(class, &Options(config))?;
-                    return found.map(Some).ok_or_else(|| format!("activation `{class}` has no counterpart"));
+                    return found.map(Some).ok_or_else(|| format!("activation `{}` has no counterpart", shown(class)));
                 }
                 _ => class,
             }
@@ -363,7 +366,7 @@ fn activation(value: &Value) -> Result<Option<LayerSpec>, String> {
         "tanh" => LayerSpec::Tanh {},
         "softsign" => LayerSpec::Softsign {},
         "leaky_relu" => LayerSpec::LeakyRelu { slope: 0.2 },
-        _ => return Err(format!("activation `{name}` has no counterpart")),
+        _ => return Err(format!("activation `{}` has no counterpart", shown(name))),
     }))
 }
 

@@ -15,7 +15,7 @@ use steersman_kernels::Isa;
 
 use self::graph::{GraphBuilder, float, int, ints};
 use self::proto::{DataType, ModelProto, OperatorSetIdProto, StringStringEntryProto};
-use super::chain::{Op, Step, chain, fold_batch_norm};
+use super::chain::{Op, Step, chain, check_finite, fold_batch_norm};
 use crate::error::{Error, Result};
 use crate::model_file::{LABEL, Model};
 
@@ -41,13 +41,14 @@ pub struct OnnxOptions {
 ///
 /// # Errors
 ///
-/// [`Error::Network`] if the weights do not fit into a file of the format, naming the layer that is too much.
+/// [`Error::Network`] if the weights do not fit into a file of the format or are not finite, folded as asked for, naming the layer.
 pub fn onnx(model: &Model, options: OnnxOptions) -> Result<Vec<u8>> {
     let recipe = &model.recipe;
     let mut steps = chain(&recipe.network(Isa::PORTABLE)?, &model.parameters);
     if options.fold_batch_norm {
         steps = fold_batch_norm(steps);
     }
+    check_finite(&steps)?;
     check_size(&steps)?;
 
     let mut graph = GraphBuilder::default();

@@ -10,7 +10,7 @@ mod rust;
 
 use steersman_kernels::Isa;
 
-use super::chain::{Op, Step, chain, fold_batch_norm};
+use super::chain::{Op, Step, chain, check_finite, fold_batch_norm};
 use crate::error::{Error, Result};
 use crate::model_file::Model;
 
@@ -30,23 +30,17 @@ const MAX_NUMBERS: usize = 1 << 22;
 ///
 /// # Errors
 ///
-/// [`Error::Network`] names a layer with more weights than a source file can sensibly hold.
+/// [`Error::Network`] names a layer with more weights than a source file can sensibly hold, or with numbers that are not finite
+/// once batch normalisation is folded in.
 pub fn source(model: &Model, language: Language) -> Result<String> {
     let steps = fold_batch_norm(chain(&model.recipe.network(Isa::PORTABLE)?, &model.parameters));
+    check_finite(&steps)?;
     for Step { name, op, .. } in &steps {
         let numbers = match op {
             Op::Conv { weight, .. } | Op::Dense { weight, .. } => weight.len(),
             Op::PRelu { slopes } => slopes.len(),
             _ => 0,
         };
-        let arrays: &[&[f32]] = match op {
-            Op::Conv { weight, bias, .. } | Op::Dense { weight, bias } => &[weight, bias],
-            _ => &[],
-        };
-        if arrays.iter().any(|values| values.iter().any(|value| !value.is_finite())) {
-            let message = "with batch normalisation folded in, its weights are not finite".into();
-            return Err(Error::Network { layer: name.clone(), message });
-        }
         if numbers > MAX_NUMBERS {
             let message =
                 format!("{numbers} weights are too many for a source file (at most {MAX_NUMBERS}); export to onnx");
