@@ -12,7 +12,7 @@ use std::net::TcpStream;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-use common::served::{Served, random_model, sample_jpeg, telemetry};
+use common::served::{Served, command, random_model, sample_jpeg, telemetry};
 use rand::Rng;
 use steersman::random::{Purpose, below, rng};
 
