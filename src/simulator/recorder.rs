@@ -417,6 +417,12 @@ mod tests {
         let options = RecordOptions { laps: 0.3, ..Default::default() };
         let recorded = drive_and_label(&track, &options, &mut Expert, 0.0).unwrap();
         let plain = drive_expert(&track, &options);
+        assert!(
+            recorded.len() > 100 && recorded.len().abs_diff(plain.len()) < 10,
+            "{} {}",
+            recorded.len(),
+            plain.len()
+        );
         assert!(recorded.iter().zip(&plain).all(|(a, b)| (a.steering - b.steering).abs() < 0.1));
         // Who never steers drifts off the line, and the labels say how to get back.
         let strength =
