@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 use serde::Serialize;
 
-use super::print_json;
+use super::{print, print_json};
 use crate::error::Result;
 use crate::pilot::Pilot;
 
@@ -35,7 +35,8 @@ pub fn run(args: PredictArgs) -> Result<()> {
     for image in args.images {
         let steering = pilot.steer_file(&image)?;
         if !args.json {
-            println!("{steering:+.4}  {:+6.2} deg  {}", f64::from(steering) * full_lock_deg, image.display());
+            let angle_deg = f64::from(steering) * full_lock_deg;
+            print(&format!("{steering:+.4}  {angle_deg:+6.2} deg  {}\n", image.display()))?;
         }
         answers.push(Answer { image, steering });
     }

@@ -82,20 +82,25 @@ impl Observer for Progress {
                 bar.reset();
             }
         }
+        // Until more than the first batch is done there is no rate.
         let rate = (images - self.images_before) as f64 / self.epoch_started.elapsed().as_secs_f64().max(1e-9);
+        let rate = Some(rate).filter(|rate| *rate > 0.0);
         match &self.bar {
             Some(bar) => {
                 self.batch_losses.push(loss);
                 if self.last_line.elapsed() >= CURVE_INTERVAL {
                     self.last_line = Instant::now();
-                    bar.set_message(format!("{rate:.0} images/s{}", self.curves()));
+                    bar.set_message(format!("{} images/s{}", or_dash(rate, 0), self.curves()));
                 }
                 bar.set_position(images as u64);
             }
             None if self.last_line.elapsed() >= PLAIN_INTERVAL => {
                 self.last_line = Instant::now();
-                let left = (of - images) as f64 / rate.max(1e-9);
-                eprintln!("epoch {epoch}: {images}/{of} images, {rate:.0} images/s, {left:.0} s left in this epoch");
+                let estimate = rate.map_or(String::new(), |rate| {
+                    let left = (of - images) as f64 / rate;
+                    format!(", {rate:.0} images/s, {left:.0} s left in this epoch")
+                });
+                eprintln!("epoch {epoch}: {images}/{of} images{estimate}");
             }
             None => {}
         }
