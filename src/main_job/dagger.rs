@@ -3,7 +3,8 @@
 use std::path::{Path, PathBuf};
 
 use super::training_set::{Take, record_takes};
-use crate::error::{Error, Result};
+use crate::error::Result;
+use crate::new_folder::NewFolder;
 use crate::pilot::Pilot;
 use crate::simulator::recorder::{drive_and_label, write_recording};
 
@@ -37,15 +38,14 @@ pub fn recordings(
 ) -> Result<Vec<PathBuf>> {
     let takes = takes_of_round(takes, round);
     if !out.exists() {
-        let parent = out.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-        let unfinished =
-            tempfile::Builder::new().prefix("unfinished-").tempdir_in(parent).map_err(Error::io(parent))?;
-        record_takes(&takes, unfinished.path(), progress, |track, take, folder, progress| {
+        let new = NewFolder::create(out)?;
+        let recorded = record_takes(&takes, new.unfinished(), progress, |track, take, folder, progress| {
             let options = take.options();
             let samples = drive_and_label(track, &options, &mut pilot.clone(), expert_share(round))?;
             write_recording(track, &options, &samples, folder, progress).map(drop)
-        })?;
-        std::fs::rename(unfinished.keep(), out).map_err(Error::io(out))?;
+        });
+        recorded.map_err(|error| new.explain(error))?;
+        new.finish()?;
     }
     Ok(takes.iter().map(|take| out.join(take.folder())).collect())
 }

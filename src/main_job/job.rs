@@ -162,6 +162,8 @@ impl<'a> Job<'a> {
     }
 
     fn train(&mut self, request: TrainRequest) -> Result<TrainResult> {
+        // The note of another run is not overwritten.
+        RunFolder::require_free(&request.out)?;
         self.note.write(&request.out)?;
         let out = request.out.clone();
         let result = training::train(request, self.observer, self.stop);
@@ -191,7 +193,21 @@ impl<'a> Job<'a> {
         let mut recordings = info.recordings;
         recordings.extend(recorded);
         self.note.round = round;
+        if self.is_own(&out, &recordings, info.seed)? {
+            self.folder = Some(out.clone());
+            return training::resume(&out, self.observer, self.stop);
+        }
         self.train(TrainRequest { recordings, recipe, out, seed: info.seed, cache_mib: info.cache_mib, from: None })
+    }
+
+    /// Whether `out` holds the run of this job's round on `recordings` already, begun before a stop.
+    fn is_own(&self, out: &Path, recordings: &[PathBuf], seed: u64) -> Result<bool> {
+        let Ok(folder) = RunFolder::open(out) else { return Ok(false) };
+        let absolute = |path: &PathBuf| std::path::absolute(path).map_err(Error::io(path));
+        let recordings: Vec<PathBuf> = recordings.iter().map(absolute).collect::<Result<_>>()?;
+        let info = folder.info()?;
+        let noted = JobNote::read(out)?.as_ref() == Some(&self.note);
+        Ok(noted && info.seed == seed && info.recordings == recordings)
     }
 
     /// Drives `model` on every track of the job.

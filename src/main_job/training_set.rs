@@ -8,10 +8,11 @@ use serde::Serialize;
 use sha2::{Digest, Sha256};
 
 use crate::error::{Error, Result};
+use crate::new_folder::NewFolder;
 use crate::simulator::{RecordOptions, Track, record};
 
 /// Random tracks in the set. Variety of looks teaches more than laps: each is driven for a fraction of a lap.
-const RANDOM_TRACKS: u64 = 48;
+pub const RANDOM_TRACKS: u64 = 48;
 /// Raised whenever the simulator draws or drives otherwise than before: sets recorded earlier are then not used again.
 const PICTURES: u32 = 2;
 /// Rows for each second: at 20 mph every 1.8 m. Twice the road teaches more than twice the frames.
@@ -128,15 +129,14 @@ pub fn recordings(
         }
         return Ok((paths, true));
     }
-    std::fs::create_dir_all(folder).map_err(Error::io(folder))?;
-    let unfinished = tempfile::Builder::new().prefix("unfinished-").tempdir_in(folder).map_err(Error::io(folder))?;
-    record_takes(takes, unfinished.path(), progress, |track, take, folder, progress| {
+    let new = NewFolder::create(&set)?;
+    let recorded = record_takes(takes, new.unfinished(), progress, |track, take, folder, progress| {
         record(track, &take.options(), folder, progress).map(drop)
-    })?;
-    let side = unfinished.path().join("set.toml");
-    std::fs::write(&side, settings).map_err(Error::io(&side))?;
-    let unfinished = unfinished.keep();
-    std::fs::rename(&unfinished, &set).map_err(Error::io(&set))?;
+    });
+    recorded.map_err(|error| new.explain(error))?;
+    let side = new.unfinished().join("set.toml");
+    std::fs::write(&side, settings).map_err(|source| new.explain(Error::Io { path: side, source }))?;
+    new.finish()?;
     Ok((paths, false))
 }
 
