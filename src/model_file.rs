@@ -62,6 +62,9 @@ pub struct TrainingRecord {
     /// The model that training began from; absent for a fresh start.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub transfer: Option<Transfer>,
+    /// Held-out tracks of the simulator that were trained on all the same, here or by the model that training began from.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub trained_on_held_out: Vec<String>,
 }
 
 /// What a training run took over from a model.

@@ -46,6 +46,7 @@ struct Loaded {
     recipe: Recipe,
     network: Network,
     parameters: Parameters,
+    trained_on_held_out: Vec<String>,
 }
 
 impl Pilot {
@@ -64,7 +65,8 @@ impl Pilot {
     ///
     /// [`Error::Network`] if the recipe's layers do not fit.
     pub fn new(model: Model, isa: Isa) -> Result<Pilot> {
-        let Model { recipe, parameters, .. } = model;
+        let Model { recipe, parameters, record, .. } = model;
+        let trained_on_held_out = record.trained_on_held_out;
         let network = recipe.network(isa)?;
         let [height, width] = recipe.preprocessing.source;
         let mut plan = InferencePlan::new(&network, 1);
@@ -76,13 +78,18 @@ impl Pilot {
             image: RgbImage::default(),
             planes: vec![0; recipe.preprocessing.output_len()],
             input: vec![0.0; recipe.preprocessing.output_len()],
-            model: Arc::new(Loaded { recipe, network, parameters }),
+            model: Arc::new(Loaded { recipe, network, parameters, trained_on_held_out }),
         })
     }
 
     /// How the model was made.
     pub fn recipe(&self) -> &Recipe {
         &self.model.recipe
+    }
+
+    /// Held-out tracks that the model was trained on all the same.
+    pub fn trained_on_held_out(&self) -> &[String] {
+        &self.model.trained_on_held_out
     }
 
     /// The network that steers.

@@ -274,3 +274,38 @@ fn real_frames_beside_ours() {
         eprintln!("{}", sheet.display());
     }
 }
+
+/// The story goes with the model, not with the recordings: they may be gone.
+#[test]
+fn every_report_on_a_model_says_what_held_out_tracks_it_was_trained_on() {
+    let folder = tempfile::tempdir().unwrap();
+    let go = |args: &str| {
+        let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_steersman"));
+        let output = command.args(args.split(' ')).current_dir(&folder).output().unwrap();
+        let text = |bytes: &[u8]| String::from_utf8(bytes.to_vec()).unwrap();
+        (output.status.success(), text(&output.stdout), text(&output.stderr))
+    };
+    for (track, out) in [("coast", "kept"), ("lake", "free")] {
+        assert!(go(&format!("record --track {track} --laps 0.1 --out {out}")).0);
+    }
+    let (done, _, message) = go("experiment split --quick --recording kept");
+    assert!(!done && message.contains("--force-held-out") && !folder.path().join("runs").exists(), "{message}");
+    let short = "--recipe lenet --set epochs=1 --cache 64";
+    let (done, text, message) = go(&format!("train kept --force-held-out {short} --out a"));
+    assert!(done && text.contains("the model was trained on coast, held-out"), "{text}{message}");
+    // What began with such a model was trained there too.
+    let (done, text, message) = go(&format!("train free --from a/model.safetensors {short} --out b --json"));
+    assert!(done && text.contains(r#""trained_on_held_out":["coast"]"#), "{text}{message}");
+    assert!(
+        std::fs::read_to_string(folder.path().join("b/report.html")).unwrap().contains("trained on coast, held-out")
+    );
+    std::fs::rename(folder.path().join("kept"), folder.path().join("moved")).unwrap();
+    let (_, text, message) = go("drive b/model.safetensors --track lake --runs 1 --out drives --json");
+    assert!(text.contains(r#""trained_on_held_out":["coast"]"#), "{text}{message}");
+    let summary = std::fs::read_to_string(folder.path().join("drives/summary.json")).unwrap();
+    assert!(summary.contains("trained_on_held_out"), "{summary}");
+    let (_, text, message) = go("evaluate a/model.safetensors free");
+    assert!(text.contains("the model was trained on coast, held-out"), "{text}{message}");
+    let (_, text, _) = go("evaluate a/model.safetensors free --json");
+    assert!(text.contains(r#""trained_on_held_out":["coast"]"#), "{text}");
+}

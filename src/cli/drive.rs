@@ -5,13 +5,12 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use clap::Args;
 use serde::Serialize;
-use steersman_kernels::Isa;
 
 use super::share_bar::ShareBar;
 use super::{pool, print_json, stop_on_ctrl_c};
-use crate::error::{Error, Result};
-use crate::main_job::held_out::{held_out_tracks, trained_on_held_out};
-use crate::model_file::Model;
+use crate::error::Result;
+use crate::main_job::held_out::trained_on_held_out;
+use crate::new_folder::NewFolder;
 use crate::pilot::Pilot;
 use crate::simulator::drive::write_trajectories;
 use crate::simulator::statistics::PairedTest;
@@ -82,10 +81,8 @@ pub fn run(args: DriveArgs) -> Result<()> {
     };
     let at_wheel = Wheel::find(&args.model)?;
     let against = args.against.as_deref().map(Wheel::find).transpose()?;
-    if let Some(out) = args.out.as_deref().filter(|out| out.exists()) {
-        let message = format!("{}: exists already and is not overwritten; name a new folder", out.display());
-        return Err(Error::Usage(message));
-    }
+    // What cannot be created is told before minutes are spent.
+    let folder = args.out.as_deref().map(NewFolder::create).transpose()?;
     let stop = stop_on_ctrl_c()?;
     let pool = pool(args.threads)?;
     let go = |wheel: &Wheel, name: &str| pool.install(|| wheel.drive(&track, &options, name, &stop));
@@ -95,12 +92,12 @@ pub fn run(args: DriveArgs) -> Result<()> {
         _ => None,
     };
     let comparison = other.as_ref().map_or(Ok(Vec::new()), |other| compare(&result, other))?;
-    if let Some(out) = &args.out {
-        write_trajectories(&result, out)?;
-    }
+    // What was measured is told even if it cannot be saved.
+    let saved = folder.map_or(Ok(()), |folder| write_trajectories(&result, folder));
     if args.json {
         let against = other.as_ref().map(|other| &other.summary);
-        return print_json(&Report { summary: &result.summary, against, comparison });
+        print_json(&Report { summary: &result.summary, against, comparison })?;
+        return saved;
     }
     print_summary(&args.model, &result.summary);
     if let (Some(other), Some(name)) = (&other, &args.against) {
@@ -113,7 +110,7 @@ pub fn run(args: DriveArgs) -> Result<()> {
             println!("{measure:<45} A {mean_a:>8.3}  B {mean_b:>8.3}  p {p_value:.4}  {verdict}");
         }
     }
-    Ok(())
+    saved
 }
 
 /// `20` or `auto`.
@@ -137,14 +134,7 @@ impl Wheel {
         Ok(match name {
             "expert" => Wheel::Expert,
             "zero" => Wheel::Zero,
-            path => {
-                let model = Model::load(Path::new(path))?;
-                let held_out = held_out_tracks(&model.record.recordings)?;
-                if !held_out.is_empty() {
-                    eprintln!("note: {path} was {}", trained_on_held_out(&held_out));
-                }
-                Wheel::Model(Box::new(Pilot::new(model, Isa::best())?))
-            }
+            path => Wheel::Model(Box::new(Pilot::load(Path::new(path))?)),
         })
     }
 
@@ -161,13 +151,20 @@ impl Wheel {
             bar.set(share);
             !stop.load(Ordering::Relaxed)
         };
-        drive(track, new_driver, options, &progress)
+        let mut result = drive(track, new_driver, options, &progress)?;
+        if let Wheel::Model(pilot) = self {
+            result.summary.trained_on_held_out = pilot.trained_on_held_out().to_vec();
+        }
+        Ok(result)
     }
 }
 
 fn print_summary(model: &str, s: &DriveSummary) {
     let held_out = if s.held_out { " (held out)" } else { "" };
     println!("{model} on {}{held_out}, {} runs", s.track, s.runs);
+    if !s.trained_on_held_out.is_empty() {
+        println!("note: {model} was {}", trained_on_held_out(&s.trained_on_held_out));
+    }
     let (low, high) = (100.0 * s.completed_low, 100.0 * s.completed_high);
     println!(
         "laps completed             {}/{} (whole runs: {low:.0} to {high:.0} %, 95 %)",

@@ -5,11 +5,13 @@ use std::path::PathBuf;
 
 use clap::Args;
 use rayon::prelude::*;
+use serde::Serialize;
 use steersman_kernels::Isa;
 
 use super::{or_dash, pool, print_json};
 use crate::dataset::{self, Camera, Recording};
 use crate::error::{Error, Result};
+use crate::main_job::held_out::trained_on_held_out;
 use crate::model_file::Model;
 use crate::pilot::Pilot;
 use crate::report::{Metrics, Prediction};
@@ -30,9 +32,19 @@ pub struct EvaluateArgs {
     json: bool,
 }
 
+/// What `evaluate --json` prints.
+#[derive(Serialize)]
+struct Report<'a> {
+    #[serde(flatten)]
+    metrics: &'a Metrics,
+    #[serde(skip_serializing_if = "<[String]>::is_empty")]
+    trained_on_held_out: &'a [String],
+}
+
 pub fn run(args: EvaluateArgs) -> Result<()> {
     let model = Model::load(&args.model)?;
     let trained_on: BTreeSet<u64> = model.training_rows.iter().copied().collect();
+    let held_out = model.record.trained_on_held_out.clone();
     let full_lock_deg = model.recipe.full_lock_deg;
     let pilot = Pilot::new(model, Isa::best())?;
 
@@ -58,7 +70,10 @@ pub fn run(args: EvaluateArgs) -> Result<()> {
         );
     }
     if args.json {
-        return print_json(&metrics);
+        return print_json(&Report { metrics: &metrics, trained_on_held_out: &held_out });
+    }
+    if !held_out.is_empty() {
+        println!("note: the model was {}", trained_on_held_out(&held_out));
     }
     println!("rows                       {}", metrics.rows);
     println!("MSE                        {:.5}", metrics.mse);

@@ -6,10 +6,12 @@ use clap::{Args, ValueEnum};
 
 use super::progress::Progress;
 use super::share_bar::Bars;
-use super::{RecipeArgs, or_dash, pool, print_json, stop_on_ctrl_c};
+use super::{RecipeArgs, or_dash, pool, print_json, refuse_existing, stop_on_ctrl_c};
 use crate::error::{Error, Result};
 use crate::main_job::experiment::{self, Plan, Subject, Trial, takes, write_csv};
+use crate::main_job::held_out::{self, trained_on_held_out};
 use crate::main_job::job::{RECORDINGS, training_set};
+use crate::main_job::training_set::RANDOM_TRACKS;
 use crate::simulator::Track;
 
 /// Compare splits or colour spaces: what the validation loss promises beside what the drive delivers
@@ -29,15 +31,19 @@ pub struct ExperimentArgs {
     #[arg(long, default_value_t = 2)]
     runs: usize,
     /// Random tracks to train on, beside lake and mountain
-    #[arg(long, default_value_t = 12, value_name = "N")]
-    random_tracks: usize,
+    #[arg(long, default_value_t = 12, value_name = "N", conflicts_with = "recordings",
+          value_parser = clap::value_parser!(u64).range(..=RANDOM_TRACKS))]
+    random_tracks: u64,
     /// Train on these recordings instead of the simulator's
     #[arg(long = "recording", value_name = "RECORDING")]
     recordings: Vec<PathBuf>,
+    /// Train on recordings of held-out tracks all the same
+    #[arg(long, requires = "recordings")]
+    force_held_out: bool,
     /// A first impression: one seed, 2 epochs, one run on one track
     #[arg(long, conflicts_with_all = ["seeds", "runs"])]
     quick: bool,
-    /// Save every trial as a line of this CSV file; must not exist
+    /// Save every trial as a line of this CSV file, which must not exist [default: runs/experiment-SUBJECT-N.csv]
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
     /// Memory for decoded images, in MiB
@@ -63,9 +69,9 @@ pub fn run(args: ExperimentArgs) -> Result<()> {
     if args.runs == 0 {
         return Err(Error::Usage("--runs 0: at least 1 run is needed".into()));
     }
-    if let Some(out) = args.out.as_deref().filter(|out| out.exists()) {
-        let message = format!("{}: exists already and is not overwritten; name a new file", out.display());
-        return Err(Error::Usage(message));
+    let held_out = held_out::check(&args.recordings, args.force_held_out)?;
+    if !held_out.is_empty() {
+        eprintln!("note: {}", trained_on_held_out(&held_out));
     }
     let mut recipe = args.recipe.find()?;
     let (seeds, runs) = if args.quick { (1, 1) } else { (args.seeds, args.runs) };
@@ -82,30 +88,59 @@ pub fn run(args: ExperimentArgs) -> Result<()> {
     }
     let stop = stop_on_ctrl_c()?;
     let (pool, bars, mut progress) = (pool(args.threads)?, Bars, Progress::new());
+    // A file that cannot be written is told before hours are spent.
+    let out = new_csv(args.out, args.subject)?;
     let recordings = match args.recordings.is_empty() {
-        true => pool.install(|| training_set(RECORDINGS.as_ref(), &takes(args.random_tracks), &bars, &stop))?,
-        false => args.recordings,
+        true => pool.install(|| training_set(RECORDINGS.as_ref(), &takes(args.random_tracks as usize), &bars, &stop)),
+        false => Ok(args.recordings),
     };
+    let recordings = recordings.inspect_err(|_| drop(std::fs::remove_file(&out)))?;
     let subject = match args.subject {
         SubjectArg::Split => Subject::Split,
         SubjectArg::Colour => Subject::Colour,
     };
     let plan = Plan { subject, recipe, seeds, recordings, tracks, runs, cache_mib: args.cache };
-    // A stop keeps what is done so far.
     let mut done = Vec::new();
     let mut told = |trial: &Trial| {
         done.push(trial.clone());
-        args.out.as_deref().map_or(Ok(()), |out| write_csv(out, &done))
+        write_csv(&out, &done)
     };
-    let trials = pool.install(|| experiment::run(&plan, &mut progress, &bars, &stop, &mut told))?;
+    let result = pool.install(|| experiment::run(&plan, &mut progress, &bars, &stop, &mut told)).map(drop);
+    // After a stop or an error too, what is done is shown and kept.
+    if done.is_empty() {
+        std::fs::remove_file(&out).map_err(Error::io(&out))?;
+        return result;
+    }
     if args.json {
-        return print_json(&trials);
+        print_json(&done)?;
+        return result;
     }
-    print_table(&plan, &trials);
-    if let Some(out) = &args.out {
+    print_table(&plan, &done);
+    if !held_out.is_empty() {
+        println!("note: {}", trained_on_held_out(&held_out));
+    }
+    if result.is_ok() {
         println!("every trial: {}", out.display());
+    } else {
+        println!("not all trials are done; those that are: {}", out.display());
     }
-    Ok(())
+    result
+}
+
+/// Creates the CSV file `out`, which must not exist, or else the first free one under `runs/`.
+fn new_csv(out: Option<PathBuf>, subject: SubjectArg) -> Result<PathBuf> {
+    let name = match subject {
+        SubjectArg::Split => "split",
+        SubjectArg::Colour => "colour",
+    };
+    let of_number = |n: u32| PathBuf::from(format!("runs/experiment-{name}-{n}.csv"));
+    let out = out.unwrap_or_else(|| (1..).map(of_number).find(|path| !path.exists()).expect("numbers go on"));
+    refuse_existing(&out)?;
+    if let Some(parent) = out.parent() {
+        std::fs::create_dir_all(parent).map_err(Error::io(parent))?;
+    }
+    std::fs::File::create_new(&out).map_err(Error::io(&out))?;
+    Ok(out)
 }
 
 fn print_table(plan: &Plan, trials: &[Trial]) {
@@ -145,7 +180,7 @@ fn print_table(plan: &Plan, trials: &[Trial]) {
     }
     println!(
         "means over the trainings; in brackets the least and most. leak: validation frames with a training frame of the same\n\
-         drive within 1 s. MSE, MAE: centre camera. fresh: frames of the driven tracks that no training has seen. laps: without\n\
-         help. autonomy: NVIDIA's, 6 s for each time the car is put back."
+         drive within 1 s. MSE, MAE: centre camera. fresh: frames of the driven tracks that no training has seen. laps and\n\
+         distance from line: without help, up to the first failure. autonomy: NVIDIA's, 6 s for each time the car is put back."
     );
 }

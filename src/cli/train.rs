@@ -54,7 +54,7 @@ pub struct TrainArgs {
           value_parser = clap::value_parser!(u32).range(..=20))]
     dagger: u32,
     /// Train on recordings of held-out tracks all the same
-    #[arg(long)]
+    #[arg(long, requires = "recordings")]
     force_held_out: bool,
     /// Print one JSON object as the last line
     #[arg(long)]
@@ -175,6 +175,9 @@ fn print_training(result: &TrainResult) {
         or_dash(result.val_mae_deg, 2),
         or_dash(result.relative_to_zero, 2)
     );
+    if !result.trained_on_held_out.is_empty() {
+        println!("note: the model was {}", trained_on_held_out(&result.trained_on_held_out));
+    }
     println!("model {}", result.model.display());
 }
 
@@ -189,4 +192,7 @@ fn print_drives(result: &MainJobResult) {
             drive.autonomy_percent, drive.interventions, drive.cte_mean_m
         );
     }
+    println!(
+        "laps and distance from line: without help, up to the first failure; autonomy and interventions: with help"
+    );
 }

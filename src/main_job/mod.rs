@@ -66,7 +66,9 @@ pub fn test_on_track(
 ) -> Result<TrackResult> {
     let new_driver = || -> Result<Box<dyn Driver>> { Ok(Box::new(pilot.clone())) };
     let offline_mae_deg = offline_mae_deg(pilot, track, options.seed)?;
-    Ok(TrackResult { drive: drive(track, new_driver, options, progress)?.summary, offline_mae_deg })
+    let mut drive = drive(track, new_driver, options, progress)?.summary;
+    drive.trained_on_held_out = pilot.trained_on_held_out().to_vec();
+    Ok(TrackResult { drive, offline_mae_deg })
 }
 
 /// Mean absolute error of `pilot` on frames that the expert sees on `track` in a drive drawn by `seed`, in degrees of the
@@ -80,17 +82,35 @@ pub fn offline_mae_deg(pilot: &Pilot, track: &Track, seed: u64) -> Result<f64> {
     let (mut pilot, world) = (pilot.clone(), track.world());
     let variant = Variant::new(world, seed);
     let (mut renderer, mut frame, mut jpeg) = (Renderer::default(), RgbFrame::default(), RoundTrip::default());
-    let every = (samples.len() / OFFLINE_FRAMES).max(1);
-    let (mut sum, mut count) = (0.0, 0);
-    for sample in samples.iter().step_by(every).take(OFFLINE_FRAMES) {
+    if samples.is_empty() {
+        return Err(Error::Usage(format!("the expert makes no way on {}", track.name())));
+    }
+    let mut sum = 0.0;
+    let count = samples.len().min(OFFLINE_FRAMES);
+    for sample in spread(samples.len(), count).map(|k| &samples[k]) {
         renderer.render(world, &variant, &Camera::new(&sample.body, Mount::Center), Mount::Center, &mut frame);
         jpeg.apply(&mut frame)?;
         let steering = pilot.steer(crate::simulator::HEIGHT, crate::simulator::WIDTH, &frame.pixels)?;
         sum += (f64::from(steering) - sample.steering).abs();
-        count += 1;
     }
-    if count == 0 {
-        return Err(Error::Usage(format!("the expert makes no way on {}", track.name())));
+    Ok(sum / count as f64 * pilot.recipe().full_lock_deg)
+}
+
+/// `count` of the places 0 to `len`, evenly over all of them.
+fn spread(len: usize, count: usize) -> impl Iterator<Item = usize> {
+    (0..count).map(move |k| k * len / count)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_frames_of_the_offline_error_are_spread_over_the_whole_drive() {
+        for len in [300, 301, 599, 899, 1500] {
+            let places: Vec<usize> = spread(len, OFFLINE_FRAMES).collect();
+            assert!(places.len() == OFFLINE_FRAMES && places[0] == 0, "{len}");
+            assert!(places.is_sorted_by(|a, b| a < b) && *places.last().unwrap() >= len - len.div_ceil(OFFLINE_FRAMES));
+        }
     }
-    Ok(sum / f64::from(count) * pilot.recipe().full_lock_deg)
 }

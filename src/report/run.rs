@@ -13,6 +13,7 @@ use super::{Metrics, Prediction, network_diagram, palette};
 use crate::atomic_file;
 use crate::dataset::{Camera, Item};
 use crate::error::Result;
+use crate::main_job::held_out::trained_on_held_out;
 use crate::network::{Network, group_digits};
 use crate::pilot::Pilot;
 use crate::training::{Data, EpochRecord, RunFolder, RunInfo, TrainResult};
@@ -90,6 +91,9 @@ fn headline(page: &mut Page, result: &TrainResult) {
             ),
             relative < 1.0,
         );
+    }
+    if !result.trained_on_held_out.is_empty() {
+        page.advice(&format!("The model was {}.", trained_on_held_out(&result.trained_on_held_out)), false);
     }
     let rows = [
         ["best epoch".to_string(), format!("{} of {}", result.best_epoch, result.epochs)],

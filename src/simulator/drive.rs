@@ -1,7 +1,6 @@
 //! Many closed-loop runs of one driver on one track, and the comparison of two drivers.
 
 use std::fmt::Write as _;
-use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Instant;
 
@@ -56,6 +55,9 @@ pub struct DriveSummary {
     pub track: String,
     /// Whether training must not see the track.
     pub held_out: bool,
+    /// Held-out tracks that the driver was trained on all the same; whoever knows the driver sets it.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub trained_on_held_out: Vec<String>,
     /// Seeds driven.
     pub runs: usize,
     /// Laps completed without help.
@@ -90,7 +92,8 @@ pub struct DriveSummary {
     pub whiteness_deg_s: f64,
     /// The same for the expert with the same seeds.
     pub expert_whiteness_deg_s: f64,
-    /// Simulated seconds for each second of the clock, all threads together; the one number that differs between runs.
+    /// Simulated seconds for each second in which a thread drives (the expert's runs left out), times the threads that its
+    /// runs can keep at work; the one number that differs between runs.
     pub realtime_factor: f64,
 }
 
@@ -119,7 +122,6 @@ where
     F: Fn() -> Result<Box<dyn Driver>> + Sync,
 {
     check(options)?;
-    let began = Instant::now();
     let done = AtomicUsize::new(0);
     let of_run = |assisted| RunOptions {
         laps: options.laps,
@@ -128,10 +130,11 @@ where
         noise: options.noise,
         assisted,
     };
-    let pairs: Vec<(RunPair, Run, f64)> = (0..options.runs as u64)
+    let pairs: Vec<(RunPair, Run, [f64; 2])> = (0..options.runs as u64)
         .into_par_iter()
         .map(|k| {
             let seed = options.seed.wrapping_add(k);
+            let began = Instant::now();
             let free = run(track, new_driver()?.as_mut(), &of_run(false), seed)?;
             let mut simulated_s = free.time_s;
             // A run that nobody would have interrupted is the same with help as without.
@@ -142,19 +145,20 @@ where
                 simulated_s += assisted.time_s;
                 assisted
             };
+            let busy_s = began.elapsed().as_secs_f64();
             let expert = run(track, &mut Expert, &of_run(false), seed)?;
             let count = done.fetch_add(1, Ordering::Relaxed) + 1;
             if !progress(count as f64 / options.runs as f64) {
                 return Err(Error::Interrupted);
             }
-            Ok((RunPair { seed, free, assisted }, expert, simulated_s))
+            Ok((RunPair { seed, free, assisted }, expert, [simulated_s, busy_s]))
         })
         .collect::<Result<_>>()?;
-    let simulated_s: f64 = pairs.iter().map(|p| p.2).sum();
+    let [simulated_s, busy_s] = [0, 1].map(|k| pairs.iter().map(|p| p.2[k]).sum::<f64>());
     let expert_sum: f64 = pairs.iter().map(|p| p.1.whiteness_sum).sum();
     let expert_s: f64 = pairs.iter().map(|p| p.1.time_s).sum();
     let runs: Vec<RunPair> = pairs.into_iter().map(|p| p.0).collect();
-    let realtime_factor = simulated_s / began.elapsed().as_secs_f64().max(1e-9);
+    let realtime_factor = simulated_s / busy_s.max(1e-9) * rayon::current_num_threads().min(options.runs) as f64;
     let summary = DriveSummary {
         expert_whiteness_deg_s: (expert_sum / expert_s.max(1e-9)).sqrt(),
         realtime_factor,
@@ -195,6 +199,7 @@ fn summarise(track: &Track, options: &DriveOptions, runs: &[RunPair]) -> DriveSu
     DriveSummary {
         track: track.name().to_string(),
         held_out: track.held_out(),
+        trained_on_held_out: Vec::new(),
         runs: runs.len(),
         laps_completed: runs.iter().map(|r| r.free.laps_completed).sum(),
         laps_total: runs.len() * options.laps,
@@ -240,13 +245,12 @@ pub fn compare(a: &DriveResult, b: &DriveResult) -> Result<Vec<PairedTest>> {
     ])
 }
 
-/// Writes the runs as `free_SEED.csv` and `assisted_SEED.csv`, and their summary as `summary.json`, into the folder `out`, which
-/// must not exist.
+/// Writes the runs as `free_SEED.csv` and `assisted_SEED.csv`, and their summary as `summary.json`, into `folder`, and
+/// gives it its name.
 ///
 /// # Errors
-/// If `out` exists or cannot be written.
-pub fn write_trajectories(result: &DriveResult, out: &Path) -> Result<()> {
-    let folder = NewFolder::create(out)?;
+/// If it cannot be written.
+pub fn write_trajectories(result: &DriveResult, folder: NewFolder) -> Result<()> {
     for pair in &result.runs {
         for (kind, run) in [("free", &pair.free), ("assisted", &pair.assisted)] {
             let path = folder.unfinished().join(format!("{kind}_{}.csv", pair.seed));

@@ -37,6 +37,9 @@ pub struct RunInfo {
     /// What the run took over from the model `from.safetensors`; absent for a fresh start.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub transfer: Option<Transfer>,
+    /// As in [`TrainingRecord`](crate::model_file::TrainingRecord).
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub trained_on_held_out: Vec<String>,
 }
 
 impl RunFolder {

@@ -16,6 +16,7 @@ use super::validation::{Validation, ValidationResult};
 use crate::atomic_file;
 use crate::dataset::loader::{Batch, Loader};
 use crate::error::{Error, Result};
+use crate::main_job::held_out::held_out_tracks;
 use crate::model_file::{Model, TrainingRecord, weights_hash};
 use crate::network::{Network, StepInput, TrainingPlan};
 use crate::optimizer::Optimizer;
@@ -83,6 +84,9 @@ pub struct TrainResult {
     pub weights_hash: String,
     /// Share of validation frames with a training frame of the same session within a second, in percent.
     pub leak_percent: f64,
+    /// Held-out tracks that were trained on all the same, here or by the model that training began from.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub trained_on_held_out: Vec<String>,
 }
 
 /// Trains anew. Call it inside a rayon pool; `stop` ends it after the current batch.
@@ -96,6 +100,12 @@ pub fn train(request: TrainRequest, observer: &mut dyn Observer, stop: &AtomicBo
     let TrainRequest { recordings, recipe, out, seed, cache_mib, from } = request;
     let start = from.as_ref().map(|from| Start::load(&from.model, from, &recipe, seed)).transpose()?;
     let data = Data::prepare(&recordings, &recipe, seed, cache_mib)?;
+    let mut trained_on_held_out = held_out_tracks(&recordings)?;
+    for track in start.iter().flat_map(|start| &start.trained_on_held_out) {
+        if !trained_on_held_out.contains(track) {
+            trained_on_held_out.push(track.clone());
+        }
+    }
     let folder = RunFolder::create(&out)?;
     folder.write_recipe(&recipe)?;
     let absolute = |path: &PathBuf| std::path::absolute(path).map_err(Error::io(path));
@@ -107,6 +117,7 @@ pub fn train(request: TrainRequest, observer: &mut dyn Observer, stop: &AtomicBo
         cache_mib,
         rows_hash: data.rows_hash(),
         transfer: start.as_ref().map(|start| start.transfer.clone()),
+        trained_on_held_out,
     };
     if let Some(from) = &from {
         let bytes = std::fs::read(&from.model).map_err(Error::io(&from.model))?;
@@ -404,6 +415,7 @@ impl Session {
                 val_center_mse: record.val_center_mse,
                 leak_percent: self.leak_percent,
                 transfer: self.info.transfer.clone(),
+                trained_on_held_out: self.info.trained_on_held_out.clone(),
             },
             training_rows: self.training_rows.clone(),
         }
@@ -450,6 +462,7 @@ impl Session {
             images_per_second: images as f64 / seconds,
             weights_hash: weights_hash(&self.network, &self.state.parameters),
             leak_percent: self.leak_percent,
+            trained_on_held_out: self.info.trained_on_held_out.clone(),
         };
         self.save_with_last(epoch_of_weights)?;
         self.folder.write_json("result.json", &result)?;

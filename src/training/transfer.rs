@@ -33,6 +33,8 @@ pub(super) struct Start {
     pub parameters: Parameters,
     /// The rows that the model has seen in training, sorted.
     pub rows: Vec<u64>,
+    /// Held-out tracks that the model was trained on.
+    pub trained_on_held_out: Vec<String>,
     /// Recipe of the model.
     recipe: Recipe,
 }
@@ -74,7 +76,8 @@ impl Start {
                 "layer `{layer}` cannot be frozen: {named} has none of that name and shape, so its weights would stay random"
             )));
         }
-        Ok(Start { transfer, parameters, rows: model.training_rows, recipe: model.recipe })
+        let trained_on_held_out = model.record.trained_on_held_out;
+        Ok(Start { transfer, parameters, rows: model.training_rows, trained_on_held_out, recipe: model.recipe })
     }
 
     /// What the user should know.
