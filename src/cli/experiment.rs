@@ -91,11 +91,10 @@ pub fn run(args: ExperimentArgs) -> Result<()> {
     // A file that cannot be written is told before hours are spent.
     let out = new_csv(args.out, args.subject)?;
     let recordings = match args.recordings.is_empty() {
-        true => {
-            pool.install(|| training_set(RECORDINGS.as_ref(), &takes(args.random_tracks as usize), &bars, &stop))?
-        }
-        false => args.recordings,
+        true => pool.install(|| training_set(RECORDINGS.as_ref(), &takes(args.random_tracks as usize), &bars, &stop)),
+        false => Ok(args.recordings),
     };
+    let recordings = recordings.inspect_err(|_| drop(std::fs::remove_file(&out)))?;
     let subject = match args.subject {
         SubjectArg::Split => Subject::Split,
         SubjectArg::Colour => Subject::Colour,
