@@ -122,7 +122,11 @@ fn an_imported_model_is_like_any_other() {
     }
     let trained = json(
         folder.path(),
-        &["train", &log, "--from", "m.safetensors", "--set", "epochs=1", "--set", "batch=8", "--out", "run", "--json"],
+        &[
+            &["train", &log, "--from", "m.safetensors", "--set", "epochs=1", "--set", "batch=8", "--out", "run"][..],
+            &["--set", "split.validation_share=0", "--json"],
+        ]
+        .concat(),
     );
     let trained = trained["model"].as_str().unwrap_or_else(|| panic!("no model in {trained}")).to_string();
     assert_eq!(json(folder.path(), &["evaluate", &trained, &log, "--json"])["rows"], 30);
