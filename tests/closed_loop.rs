@@ -41,7 +41,7 @@ fn learn(folder: &Path, threads: usize) -> (TrainResult, TrackResult) {
         let result = train(request, &mut Silent, &AtomicBool::new(false)).unwrap();
         let pilot = Pilot::load(&result.model).unwrap();
         let options = DriveOptions { runs: 4, ..Default::default() };
-        let on_track = test_on_track(&pilot, &Track::load("lake").unwrap(), &options, &|_| true).unwrap();
+        let on_track = test_on_track(&pilot, &Track::load("lake").unwrap(), &options, None, &|_| true).unwrap();
         (result, on_track)
     })
 }
@@ -107,7 +107,8 @@ fn a_job_that_was_stopped_goes_on_through_dagger_to_the_drives() {
     let folder = tempfile::tempdir().unwrap();
     let never = AtomicBool::new(false);
     let note = JobNote { runs: 1, dagger_rounds: 1, round: 0 };
-    let request = |name: &str| JobRequest { recipe: lenet(2), out: folder.path().join(name), seed: 5, cache_mib: 64 };
+    let request =
+        |name: &str| JobRequest { recipe: lenet(2), out: folder.path().join(name), seed: 5, cache_mib: 64, from: None };
     let (mut watcher, scope) = (Silent, small_scope(folder.path()));
     let mut whole = Job::new(scope.clone(), note.clone(), &mut watcher, &Silent, &never);
     let expected = whole.begin(request("whole")).unwrap();
@@ -115,6 +116,9 @@ fn a_job_that_was_stopped_goes_on_through_dagger_to_the_drives() {
     assert_eq!((expected.drives.len(), expected.drives[0].drive.track.as_str()), (1, "lake"));
     assert!(folder.path().join("whole/dagger/lake/driving_log.csv").is_file());
     let saved = std::fs::read_to_string(folder.path().join("whole-dagger-1/drives.json")).unwrap();
+    for name in ["summary.json", "free_1.csv", "assisted_1.csv"] {
+        assert!(folder.path().join("whole-dagger-1/drives/lake").join(name).is_file(), "{name}");
+    }
     assert!(saved.contains("\"track\": \"lake\"") && saved.contains("offline_mae_deg"), "{saved}");
     let last_note = JobNote::read(&folder.path().join("whole-dagger-1")).unwrap();
     assert_eq!(last_note, Some(JobNote { round: 1, ..note.clone() }));

@@ -93,6 +93,8 @@ fn ctrl_c_saves_in_the_middle_of_an_epoch_and_the_run_goes_on_to_the_same_bits()
     child.stderr.take().unwrap().read_to_string(&mut message).unwrap();
     assert_eq!(status.code(), Some(130), "{message}");
     assert!(message.contains("go on with: steersman train --resume stopped"), "{message}");
+    let page = std::fs::read_to_string(folder.path().join("stopped/report.html")).unwrap();
+    assert!(page.contains("was stopped after"), "the page of a stopped run says so");
     assert_same_result(folder.path(), "stopped", &whole);
 }
 

@@ -31,7 +31,7 @@ pub struct TrainArgs {
     #[arg(long, default_value_t = 1)]
     seed: u64,
     /// Begin with the weights of a model where layers have the same name and shape; without --recipe, with its recipe
-    #[arg(long, value_name = "MODEL", requires = "recordings", conflicts_with = "resume")]
+    #[arg(long, value_name = "MODEL", conflicts_with_all = ["resume", "dagger"])]
     from: Option<PathBuf>,
     /// Layers that keep the weights they were given, as in conv1,bn1
     #[arg(long, value_name = "LAYER", requires = "from", value_delimiter = ',')]
@@ -69,6 +69,11 @@ pub fn run(args: TrainArgs) -> Result<()> {
     let stop = stop_on_ctrl_c()?;
     let pool = pool(args.threads)?;
     let mut progress = Progress::new();
+    let from = args.from.map(|model| TransferRequest { model, freeze: args.freeze });
+    let recipe = || match &from {
+        Some(from) => args.recipe.find_or_of(&from.model),
+        None => args.recipe.find(),
+    };
     let note = match &args.resume {
         Some(folder) => JobNote::read(folder)?,
         None if args.recordings.is_empty() => Some(JobNote { runs: args.runs, dagger_rounds: args.dagger, round: 0 }),
@@ -80,15 +85,16 @@ pub fn run(args: TrainArgs) -> Result<()> {
         let result = match args.resume {
             Some(folder) => pool.install(|| job.go_on(&folder)),
             None => {
-                let recipe = args.recipe.find()?;
+                let recipe = recipe()?;
                 let out = args.out.unwrap_or_else(|| RunFolder::next_free(&recipe.name));
-                let request = JobRequest { recipe, out, seed: args.seed, cache_mib: args.cache };
+                let request = JobRequest { recipe, out, seed: args.seed, cache_mib: args.cache, from };
                 pool.install(|| job.begin(request))
             }
         };
-        let result = explain_stop(result, job.folder())?;
-        if let Some(folder) = job.folder() {
-            pool.install(|| write_report(folder));
+        let folder = job.folder().map(Path::to_path_buf);
+        let result = pool.install(|| explain_stop(result, folder.as_deref()))?;
+        if let Some(folder) = folder {
+            pool.install(|| write_report(&folder));
         }
         if args.json {
             return print_json(&result);
@@ -108,10 +114,7 @@ pub fn run(args: TrainArgs) -> Result<()> {
             (folder, result)
         }
         None => {
-            let recipe = match &args.from {
-                Some(from) => args.recipe.find_or_of(from)?,
-                None => args.recipe.find()?,
-            };
+            let recipe = recipe()?;
             let held_out = held_out::check(&args.recordings, args.force_held_out)?;
             if !held_out.is_empty() {
                 eprintln!("note: {}", trained_on_held_out(&held_out));
@@ -123,13 +126,13 @@ pub fn run(args: TrainArgs) -> Result<()> {
                 out: out.clone(),
                 seed: args.seed,
                 cache_mib: args.cache,
-                from: args.from.map(|model| TransferRequest { model, freeze: args.freeze }),
+                from,
             };
             let result = pool.install(|| training::train(request, &mut progress, &stop));
             (out, result)
         }
     };
-    let result = explain_stop(result, Some(&folder))?;
+    let result = pool.install(|| explain_stop(result, Some(&folder)))?;
     pool.install(|| write_report(&folder));
     if args.json {
         return print_json(&result);
@@ -146,11 +149,18 @@ fn write_report(folder: &Path) {
     }
 }
 
-/// Says after a stop how to go on: with the run in `folder`, if there is one.
+/// Says after a stop how to go on: with the run in `folder`, if there is one, which gets its page too. Call it inside a rayon
+/// pool.
 fn explain_stop<T>(result: Result<T>, folder: Option<&Path>) -> Result<T> {
     if let Err(Error::Interrupted) = &result {
         match folder {
-            Some(folder) => eprintln!("stopped and saved; go on with: steersman train --resume {}", folder.display()),
+            Some(folder) => {
+                eprintln!("stopped and saved; go on with: steersman train --resume {}", folder.display());
+                // Before the first epoch has ended there is nothing to report.
+                if folder.join("model.safetensors").exists() {
+                    write_report(folder);
+                }
+            }
             None => eprintln!("stopped; nothing was trained yet, and what was recorded is not kept"),
         }
     }

@@ -141,7 +141,7 @@ pub fn run(
             let training = training::train(request, observer, stop)?;
             let options = DriveOptions { runs: plan.runs, ..Default::default() };
             let pilot = Pilot::load(&training.model)?;
-            let drives = test_on_tracks(&pilot, &plan.tracks, &options, stages, stop)?;
+            let drives = test_on_tracks(&pilot, &plan.tracks, &options, None, stages, stop)?;
             let mean = |of: &dyn Fn(&TrackResult) -> f64| drives.iter().map(of).sum::<f64>() / drives.len() as f64;
             let trial = Trial {
                 variant: variant.into(),

@@ -14,7 +14,7 @@ use crate::error::{Error, Result};
 use crate::pilot::Pilot;
 use crate::recipe::Recipe;
 use crate::simulator::{DriveOptions, Track};
-use crate::training::{self, Observer, RunFolder, TrainRequest, TrainResult};
+use crate::training::{self, Observer, RunFolder, TrainRequest, TrainResult, TransferRequest};
 
 /// Where the main job keeps what it records.
 pub const RECORDINGS: &str = "data/recordings";
@@ -104,6 +104,8 @@ pub struct JobRequest {
     pub seed: u64,
     /// Memory for decoded images in MiB.
     pub cache_mib: usize,
+    /// Weights to begin the first training with; rounds of DAgger begin anew.
+    pub from: Option<TransferRequest>,
 }
 
 impl<'a> Job<'a> {
@@ -129,13 +131,13 @@ impl<'a> Job<'a> {
     ///
     /// As [`training_set::recordings`], [`training::train`] and [`test_on_track`]; [`Error::Interrupted`] after a stop.
     pub fn begin(&mut self, request: JobRequest) -> Result<MainJobResult> {
-        let JobRequest { recipe, out, seed, cache_mib } = request;
+        let JobRequest { recipe, out, seed, cache_mib, from } = request;
         RunFolder::require_free(&out)?;
         for round in 1..=self.note.dagger_rounds {
             RunFolder::require_free(&dagger_folder(&out, 0, round)?)?;
         }
         let recordings = training_set(&self.scope.recordings, &self.scope.takes, self.stages, self.stop)?;
-        let training = self.train(TrainRequest { recordings, recipe, out, seed, cache_mib, from: None })?;
+        let training = self.train(TrainRequest { recordings, recipe, out, seed, cache_mib, from })?;
         self.rest(training)
     }
 
@@ -214,11 +216,13 @@ impl<'a> Job<'a> {
     fn drives(&self, model: &Path) -> Result<Vec<TrackResult>> {
         let pilot = Pilot::load(model)?;
         let options = DriveOptions { runs: self.note.runs, ..Default::default() };
-        test_on_tracks(&pilot, &self.scope.tracks, &options, self.stages, self.stop)
+        let keep = self.folder.as_ref().map(|folder| folder.join("drives"));
+        test_on_tracks(&pilot, &self.scope.tracks, &options, keep.as_deref(), self.stages, self.stop)
     }
 }
 
-/// Puts `pilot` to the test on all of `tracks` at once; the results are in their order. Call it inside a rayon pool.
+/// Puts `pilot` to the test on all of `tracks` at once; the results are in their order, trajectories below `keep`. Call it
+/// inside a rayon pool.
 ///
 /// # Errors
 ///
@@ -227,6 +231,7 @@ pub fn test_on_tracks<T: AsRef<str> + Sync>(
     pilot: &Pilot,
     tracks: &[T],
     options: &DriveOptions,
+    keep: Option<&Path>,
     stages: &dyn Stages,
     stop: &AtomicBool,
 ) -> Result<Vec<TrackResult>> {
@@ -240,7 +245,7 @@ pub fn test_on_tracks<T: AsRef<str> + Sync>(
             told(shares.iter().sum::<f64>() / shares.len() as f64);
             !stop.load(Ordering::Relaxed)
         };
-        test_on_track(pilot, &track, options, &progress)
+        test_on_track(pilot, &track, options, keep, &progress)
     };
     tracks.par_iter().enumerate().map(on_track).collect()
 }

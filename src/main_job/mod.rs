@@ -6,10 +6,14 @@ pub mod held_out;
 pub mod job;
 pub mod training_set;
 
+use std::path::Path;
+
 use serde::Serialize;
 
 use crate::error::{Error, Result};
+use crate::new_folder::NewFolder;
 use crate::pilot::Pilot;
+use crate::simulator::drive::write_trajectories;
 use crate::simulator::jpeg::RoundTrip;
 use crate::simulator::recorder::drive_expert;
 use crate::simulator::{
@@ -53,22 +57,30 @@ pub struct MainJobResult {
 }
 
 /// Puts `pilot` to the test on `track`. Call it inside a rayon pool; `progress` is told the share of the runs that are done
-/// and may return `false` to stop.
+/// and may return `false` to stop. The trajectories are saved in a folder below `keep`, if one is named; what lies there
+/// already from this test before a stop is left.
 ///
 /// # Errors
 ///
-/// As [`drive()`].
+/// As [`drive()`] and [`write_trajectories`].
 pub fn test_on_track(
     pilot: &Pilot,
     track: &Track,
     options: &DriveOptions,
+    keep: Option<&Path>,
     progress: &(dyn Fn(f64) -> bool + Sync),
 ) -> Result<TrackResult> {
     let new_driver = || -> Result<Box<dyn Driver>> { Ok(Box::new(pilot.clone())) };
     let offline_mae_deg = offline_mae_deg(pilot, track, options.seed)?;
-    let mut drive = drive(track, new_driver, options, progress)?.summary;
-    drive.trained_on_held_out = pilot.trained_on_held_out().to_vec();
-    Ok(TrackResult { drive, offline_mae_deg })
+    let mut drive = drive(track, new_driver, options, progress)?;
+    drive.summary.trained_on_held_out = pilot.trained_on_held_out().to_vec();
+    // Names of random tracks have a colon, which no file's name has everywhere.
+    let folder =
+        keep.map(|keep| keep.join(track.name().replace(['/', '\\', ':'], "-"))).filter(|folder| !folder.exists());
+    if let Some(folder) = folder {
+        write_trajectories(&drive, NewFolder::create(&folder)?)?;
+    }
+    Ok(TrackResult { drive: drive.summary, offline_mae_deg })
 }
 
 /// Mean absolute error of `pilot` on frames that the expert sees on `track` in a drive drawn by `seed`, in degrees of the

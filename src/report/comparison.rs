@@ -254,7 +254,7 @@ fn drives(page: &mut Page, runs: &[RunView]) {
     page.section("On the road");
     if runs.iter().all(|run| run.drives.is_empty()) {
         page.paragraph(
-            "No drives lie in these folders. `steersman drive RUN/last.safetensors --track lake --out RUN/drives/lake` puts one there.",
+            "No drives lie in these folders (`train` without a recording puts some there). `steersman drive RUN/last.safetensors --track lake --out RUN/drives/lake` puts one there.",
         );
         return;
     }

@@ -54,8 +54,9 @@ fn page(folder: &RunFolder, path: &Path) -> Result<String> {
     let data = Data::prepare(&info.recordings, &recipe, info.seed, 0)?;
     let lead = format!("Recipe {}: {}", recipe.name, recipe.about);
     let mut page = Page::new(&path.display().to_string(), &lead);
-    if let Some(result) = folder.result()? {
-        headline(&mut page, &result);
+    match folder.result()? {
+        Some(result) => headline(&mut page, &result),
+        None => page.advice(&unfinished(history.len(), recipe.epochs, path), false),
     }
     curves(&mut page, &history);
     let answers = answers(&pilot, &data);
@@ -76,6 +77,11 @@ fn page(folder: &RunFolder, path: &Path) -> Result<String> {
     environment(&mut page, &info, &history);
     page.folded("The recipe with every entry resolved", &recipe.to_toml()?);
     Ok(page.finish())
+}
+
+fn unfinished(epochs: usize, of: u32, path: &Path) -> String {
+    let go_on = format!("steersman train --resume {}", path.display());
+    format!("This run was stopped after {epochs} of {of} epochs; `{go_on}` goes on with it.")
 }
 
 fn headline(page: &mut Page, result: &TrainResult) {
