@@ -13,8 +13,9 @@ use crate::pilot::Pilot;
 const HORIZON: f64 = 0.355;
 /// Where the bonnet begins.
 const BONNET: f64 = 0.85;
-/// Half width of the road at the horizon and at the bonnet, as a share of the width.
-const ROAD_HALF: [f64; 2] = [0.08, 0.55];
+/// Half width of the road with its edges at the horizon and at the bonnet, as a share of the width: 5 m on a level road seen
+/// from 1.2 m up, and room for bends far away.
+const ROAD_HALF: [f64; 2] = [0.08, 1.1];
 /// Share of the width that pictures are shifted by.
 const SHIFT: f64 = 0.0625;
 /// Factors of darker and brighter pictures.
@@ -41,7 +42,7 @@ pub enum Change {
     MaskSky,
     /// The lowest 15 %.
     MaskBonnet,
-    /// A trapezium from the horizon to the bonnet.
+    /// A trapezium from the horizon to the bonnet that holds the road and its edges.
     MaskRoad,
     /// What is left and right of that trapezium.
     MaskBeside,
@@ -82,7 +83,7 @@ impl Change {
         match self {
             Change::MaskSky => "sky masked",
             Change::MaskBonnet => "bonnet masked",
-            Change::MaskRoad => "road masked",
+            Change::MaskRoad => "road and its edges masked",
             Change::MaskBeside => "everything beside the road masked",
             Change::MaskLeft => "left half masked",
             Change::MaskRight => "right half masked",
@@ -368,7 +369,8 @@ fn conclusion(effects: &[Effect], spread_deg: f64) -> Vec<String> {
         sentences.push("It does not steer back when the road lies to one side: it has not learned to recover. Use side cameras, shifts or recordings of recovery.".into());
     }
     if !passed(Change::Mirror) {
-        sentences.push("In a mirrored world it steers differently: it has learned this track, or one side. Train with samples.flip=random.".into());
+        sentences.push("In a mirrored world it steers differently: it has learned this track, or one side. Train with samples.flip=random, \
+             unless the camera is mounted askew (Udacity's is rolled by 1.2°): mirrored pictures then show the car beside its place.".into());
     }
     let (left, right) = (moved(Change::MaskLeft), moved(Change::MaskRight));
     if left.max(right) > 2.0 * left.min(right) {
@@ -406,6 +408,12 @@ mod tests {
             (road.pixel(100, 160), road.pixel(60, 20), road.pixel(150, 160)),
             ([100, 79, 90], image.pixel(60, 20), image.pixel(150, 160))
         );
+        // The edges of a road 9 m wide, seen from its middle, belong to it: 10 m ahead they are 4.5 / 10 focal lengths aside.
+        let (focal, ten_metres_ahead) = (160.0 / 2.0 / 30f64.to_radians().tan(), HORIZON + 1.2 / 10.0 * 0.866);
+        for side in [-1.0, 1.0] {
+            let edge = 0.5 + side * 0.45 * focal / 320.0;
+            assert!(Change::MaskRoad.masks(ten_metres_ahead, edge), "{side}");
+        }
         let beside = changed(Change::MaskBeside);
         assert_eq!((beside.pixel(100, 160), beside.pixel(60, 20)), (image.pixel(100, 160), [60, 79, 90]));
         assert_eq!(changed(Change::ShiftRight).pixel(7, 120), image.pixel(7, 100));
@@ -414,7 +422,7 @@ mod tests {
         assert_eq!(changed(Change::Darken).pixel(100, 0), [60, 0, 54]);
         assert_eq!(changed(Change::Brighten).pixel(100, 0), [140, 0, 126]);
         // Each pixel between horizon and bonnet belongs to the road or to what is beside it.
-        for (y, x) in [(0.4, 0.1), (0.5, 0.5), (0.8, 0.9), (0.8, 0.01)] {
+        for (y, x) in [(0.4, 0.1), (0.5, 0.5), (0.8, 0.9), (0.45, 0.01)] {
             assert!(Change::MaskRoad.masks(y, x) != Change::MaskBeside.masks(y, x), "{y} {x}");
         }
     }

@@ -17,7 +17,8 @@ table { border-collapse: collapse; margin: 12px 0; font-size: 14px; }
 th { text-align: left; border-bottom: 2px solid #1a1a1a; padding: 4px 14px 4px 0; vertical-align: bottom; }
 td { border-bottom: 1px solid #ddd; padding: 4px 14px 4px 0; vertical-align: top; overflow-wrap: anywhere; }
 td.s { white-space: nowrap; }
-td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
+td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; }
+td.n { white-space: nowrap; }
 .row { display: flex; flex-wrap: wrap; gap: 16px; align-items: flex-start; margin: 12px 0; }
 .grid { display: grid; gap: 14px 12px; margin: 12px 0; }
 figure { margin: 0; }
