@@ -2,7 +2,6 @@
 
 pub mod dagger;
 pub mod experiment;
-pub mod held_out;
 pub mod job;
 pub mod training_set;
 
