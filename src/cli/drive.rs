@@ -8,8 +8,8 @@ use serde::Serialize;
 
 use super::share_bar::ShareBar;
 use super::{pool, print_json, stop_on_ctrl_c};
+use crate::dataset::held_out::trained_on_held_out;
 use crate::error::Result;
-use crate::main_job::held_out::trained_on_held_out;
 use crate::new_folder::NewFolder;
 use crate::pilot::Pilot;
 use crate::simulator::drive::write_trajectories;

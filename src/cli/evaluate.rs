@@ -9,9 +9,9 @@ use serde::Serialize;
 use steersman_kernels::Isa;
 
 use super::{or_dash, pool, print_json};
+use crate::dataset::held_out::trained_on_held_out;
 use crate::dataset::{self, Camera, Recording};
 use crate::error::{Error, Result};
-use crate::main_job::held_out::trained_on_held_out;
 use crate::model_file::Model;
 use crate::pilot::Pilot;
 use crate::report::{Metrics, Prediction};

@@ -8,10 +8,10 @@ use clap::Args;
 use super::progress::Progress;
 use super::share_bar::Bars;
 use super::{RecipeArgs, or_dash, pool, print_json, stop_on_ctrl_c};
+use crate::dataset::held_out::{self, trained_on_held_out};
 use crate::error::{Error, Result};
-use crate::main_job::held_out::trained_on_held_out;
 use crate::main_job::job::{Job, JobNote, JobRequest, Scope};
-use crate::main_job::{MainJobResult, TrackResult, held_out};
+use crate::main_job::{MainJobResult, TrackResult};
 use crate::report;
 use crate::training::{self, RunFolder, TrainRequest, TrainResult, TransferRequest};
 

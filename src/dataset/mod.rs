@@ -17,6 +17,7 @@ mod decimal_comma;
 pub mod decode;
 mod driving_log;
 mod files;
+pub mod held_out;
 pub mod inspect;
 pub mod leak;
 mod load;

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
 use serde::Serialize;
+use serde_json::Value;
 
 use super::job::{Stages, test_on_tracks};
 use super::{TrackResult, training_set};
@@ -96,6 +97,8 @@ pub struct Trial {
     pub autonomy_percent: f64,
     /// Mean over the tracks of the distance from the line, m.
     pub cte_mean_m: f64,
+    /// Held-out tracks that were trained on all the same.
+    pub trained_on_held_out: Vec<String>,
 }
 
 /// Recordings of the main job's set that an experiment trains on: both training tracks, and of the random tracks as many
@@ -154,6 +157,7 @@ pub fn run(
                 laps_total: drives.iter().map(|d| d.drive.laps_total).sum(),
                 autonomy_percent: mean(&|d| d.drive.autonomy_percent),
                 cte_mean_m: mean(&|d| d.drive.cte_mean_m),
+                trained_on_held_out: training.trained_on_held_out,
             };
             told(&trial)?;
             trials.push(trial);
@@ -162,18 +166,35 @@ pub fn run(
     Ok(trials)
 }
 
-/// Writes `trials` as CSV, in whole or not at all.
+/// Writes `trials` as CSV, in whole or not at all; several tracks in one field are separated by spaces.
 ///
 /// # Errors
 ///
 /// [`Error::Io`].
 pub fn write_csv(path: &Path, trials: &[Trial]) -> Result<()> {
     let mut writer = csv::Writer::from_writer(Vec::new());
-    for trial in trials {
-        writer.serialize(trial).map_err(|e| Error::data(path, e.to_string()))?;
+    for (at, trial) in trials.iter().enumerate() {
+        // A record of CSV cannot hold a list, so it is made from the JSON.
+        let Value::Object(fields) = serde_json::to_value(trial).map_err(|e| Error::data(path, e.to_string()))? else {
+            unreachable!("a struct is an object")
+        };
+        if at == 0 {
+            writer.write_record(fields.keys()).map_err(|e| Error::data(path, e.to_string()))?;
+        }
+        writer.write_record(fields.values().map(field)).map_err(|e| Error::data(path, e.to_string()))?;
     }
     let bytes = writer.into_inner().map_err(|e| Error::data(path, e.to_string()))?;
     atomic_file::write(path, &bytes)
+}
+
+/// A JSON value as a field of CSV.
+fn field(value: &Value) -> String {
+    match value {
+        Value::Null => String::new(),
+        Value::String(text) => text.clone(),
+        Value::Array(items) => items.iter().map(field).collect::<Vec<_>>().join(" "),
+        other => other.to_string(),
+    }
 }
 
 #[cfg(test)]
@@ -195,6 +216,32 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn the_csv_has_every_field_and_tells_held_out_tracks() {
+        let trial = Trial {
+            variant: "blocks".into(),
+            seed: 3,
+            leak_percent: 12.5,
+            val_center_mse: None,
+            val_mae_deg: Some(0.25),
+            fresh_mae_deg: 1.0,
+            laps_completed: 2,
+            laps_total: 4,
+            autonomy_percent: 99.0,
+            cte_mean_m: 0.1,
+            trained_on_held_out: vec!["coast".into(), "random:1000001".into()],
+        };
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("trials.csv");
+        write_csv(&path, &[trial.clone(), Trial { trained_on_held_out: Vec::new(), ..trial }]).unwrap();
+        let text = std::fs::read_to_string(&path).unwrap();
+        let expected = "variant,seed,leak_percent,val_center_mse,val_mae_deg,fresh_mae_deg,laps_completed,laps_total,\
+                        autonomy_percent,cte_mean_m,trained_on_held_out\n\
+                        blocks,3,12.5,,0.25,1.0,2,4,99.0,0.1,coast random:1000001\n\
+                        blocks,3,12.5,,0.25,1.0,2,4,99.0,0.1,\n";
+        assert_eq!(text, expected);
     }
 
     #[test]

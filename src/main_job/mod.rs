@@ -2,7 +2,6 @@
 
 pub mod dagger;
 pub mod experiment;
-pub mod held_out;
 pub mod job;
 pub mod training_set;
 
@@ -14,11 +13,9 @@ use crate::error::{Error, Result};
 use crate::new_folder::NewFolder;
 use crate::pilot::Pilot;
 use crate::simulator::drive::write_trajectories;
-use crate::simulator::jpeg::RoundTrip;
+use crate::simulator::eye::Eye;
 use crate::simulator::recorder::drive_expert;
-use crate::simulator::{
-    Camera, DriveOptions, DriveSummary, Driver, Mount, RecordOptions, Renderer, RgbFrame, Track, Variant, drive,
-};
+use crate::simulator::{DriveOptions, DriveSummary, Driver, HEIGHT, RecordOptions, Track, WIDTH, drive};
 use crate::training::TrainResult;
 
 /// Tracks that the main job drives on: those of the training set, then held-out ones.
@@ -91,18 +88,15 @@ pub fn test_on_track(
 /// [`Error::Usage`] if a picture cannot be encoded.
 pub fn offline_mae_deg(pilot: &Pilot, track: &Track, seed: u64) -> Result<f64> {
     let samples = drive_expert(track, &RecordOptions { seed, ..Default::default() });
-    let (mut pilot, world) = (pilot.clone(), track.world());
-    let variant = Variant::new(world, seed);
-    let (mut renderer, mut frame, mut jpeg) = (Renderer::default(), RgbFrame::default(), RoundTrip::default());
+    let (mut pilot, mut eye) = (pilot.clone(), Eye::new(track, seed));
     if samples.is_empty() {
         return Err(Error::Usage(format!("the expert makes no way on {}", track.name())));
     }
     let mut sum = 0.0;
     let count = samples.len().min(OFFLINE_FRAMES);
     for sample in spread(samples.len(), count).map(|k| &samples[k]) {
-        renderer.render(world, &variant, &Camera::new(&sample.body, Mount::Center), Mount::Center, &mut frame);
-        jpeg.apply(&mut frame)?;
-        let steering = pilot.steer(crate::simulator::HEIGHT, crate::simulator::WIDTH, &frame.pixels)?;
+        let frame = eye.look_from(&sample.body)?;
+        let steering = pilot.steer(HEIGHT, WIDTH, &frame.pixels)?;
         sum += (f64::from(steering) - sample.steering).abs();
     }
     Ok(sum / count as f64 * pilot.recipe().full_lock_deg)

@@ -1,6 +1,6 @@
 //! The front camera of a run, with the light that its seed draws.
 
-use super::camera::{Camera, Mount, RgbFrame};
+use super::camera::{BodyPose, Camera, Mount, RgbFrame};
 use super::jpeg;
 use super::light::Variant;
 use super::renderer::Renderer;
@@ -34,7 +34,11 @@ impl<'a> Eye<'a> {
     /// # Errors
     /// If the picture cannot be encoded.
     pub fn jpeg(&mut self, simulation: &Simulation) -> Result<&[u8]> {
-        let camera = Camera::new(&simulation.body_pose(), Mount::Center);
+        self.take(&simulation.body_pose())
+    }
+
+    fn take(&mut self, body: &BodyPose) -> Result<&[u8]> {
+        let camera = Camera::new(body, Mount::Center);
         self.renderer.render(self.track.world(), &self.variant, &camera, Mount::Center, &mut self.frame);
         self.bytes.clear();
         jpeg::encode(&self.frame, &mut self.bytes)?;
@@ -46,7 +50,15 @@ impl<'a> Eye<'a> {
     /// # Errors
     /// If the picture cannot be encoded or decoded.
     pub fn look(&mut self, simulation: &Simulation) -> Result<&RgbFrame> {
-        self.jpeg(simulation)?;
+        self.look_from(&simulation.body_pose())
+    }
+
+    /// The same for a car whose body is at `body`.
+    ///
+    /// # Errors
+    /// As [`look`](Eye::look).
+    pub fn look_from(&mut self, body: &BodyPose) -> Result<&RgbFrame> {
+        self.take(body)?;
         jpeg::decode(&self.bytes, &mut self.frame)?;
         Ok(&self.frame)
     }

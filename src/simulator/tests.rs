@@ -82,6 +82,19 @@ fn unknown_tracks_name_the_nearest() {
 }
 
 #[test]
+fn a_track_file_cannot_pass_for_a_built_in_track() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("mine.toml");
+    let path = path.to_str().unwrap();
+    for (own, taken) in [("lake", true), ("random:7", true), ("lakeside", false)] {
+        fs::write(path, toml::to_string(&TrackSpec { name: own.into(), ..lake_spec() }).unwrap()).unwrap();
+        let expected = if taken { format!("{own} ({path})") } else { own.to_string() };
+        assert_eq!(Track::load(path).unwrap().name(), expected);
+    }
+    assert_eq!(Track::load("lake").unwrap().name(), "lake");
+}
+
+#[test]
 fn bad_track_files_are_refused_with_place_and_remedy() {
     let eight = |i: usize| {
         let a = i as f64 / 24.0 * std::f64::consts::TAU;

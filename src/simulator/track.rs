@@ -14,6 +14,8 @@ use crate::{Error, Result};
 
 /// Random tracks with this seed or a higher one are kept out of training.
 pub const FIRST_HELD_OUT_SEED: u64 = 1_000_000;
+/// What the names of random tracks begin with.
+const RANDOM: &str = "random:";
 
 /// One point of the reference line.
 #[derive(Clone, Copy, Debug)]
@@ -71,7 +73,7 @@ impl Track {
     /// An unknown name, naming the nearest known one; an unreadable file; a track that fails the checks of
     /// [`from_spec`](Track::from_spec).
     pub fn load(name: &str) -> Result<Track> {
-        if let Some(seed) = name.strip_prefix("random:") {
+        if let Some(seed) = name.strip_prefix(RANDOM) {
             let seed = seed.parse().map_err(|_| {
                 Error::Usage(format!("track `{name}`: `{seed}` is no seed; write for example random:7"))
             })?;
@@ -82,7 +84,13 @@ impl Track {
         }
         if name.ends_with(".toml") {
             let text = std::fs::read_to_string(name).map_err(Error::io(Path::new(name)))?;
-            return Track::from_toml(&text, name);
+            let mut track = Track::from_toml(&text, name)?;
+            // Reports tell tracks by their names, so a file must not pass for a track that comes with the program.
+            let own = &track.spec.name;
+            if builtin::text(own).is_some() || own.starts_with(RANDOM) {
+                track.spec.name = format!("{own} ({name})");
+            }
+            return Ok(track);
         }
         let known = builtin::names().collect::<Vec<_>>();
         let nearest =
@@ -201,7 +209,8 @@ impl Track {
         self.spec.held_out
     }
 
-    /// Name as used on the command line.
+    /// Name in reports: of built-in and random tracks the one on the command line; of a file its `name`, followed by its path
+    /// if the name is that of a built-in or random track.
     pub fn name(&self) -> &str {
         &self.spec.name
     }
