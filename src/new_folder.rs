@@ -59,6 +59,21 @@ impl NewFolder {
         Ok(())
     }
 
+    /// Gives the folder its name, for what cannot be done again: if something has come to be at its place, a number is added,
+    /// as in `DIR-2`, and if it cannot be renamed it stays under its hidden name. The name that it got.
+    pub fn finish_anyhow(self) -> PathBuf {
+        let numbered = |n: usize| {
+            let mut name = self.path.clone().into_os_string();
+            name.push(format!("-{n}"));
+            PathBuf::from(name)
+        };
+        let names = std::iter::once(self.path.clone()).chain((2..100).map(numbered));
+        let free = names.into_iter().find(|name| fs::symlink_metadata(name).is_err());
+        let renamed = free.filter(|name| fs::rename(self.unfinished.path(), name).is_ok());
+        let hidden = self.unfinished.keep();
+        renamed.unwrap_or(hidden)
+    }
+
     /// An error of writing to the folder, as its user should read it: with the place that was meant, and a remedy where the
     /// disk is full.
     pub fn explain(&self, error: Error) -> Error {
@@ -138,6 +153,23 @@ mod tests {
         assert!(late.finish().unwrap_err().to_string().contains("exists already"));
         assert_eq!(fs::read_to_string(&out).unwrap(), "mine");
         assert_eq!(fs::read_dir(scratch.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn what_cannot_be_done_again_is_kept_under_another_name() {
+        let scratch = tempfile::tempdir().unwrap();
+        let out = scratch.path().join("out");
+        let folder = || {
+            let folder = NewFolder::create(&out).unwrap();
+            fs::write(folder.unfinished().join("a"), "1").unwrap();
+            folder
+        };
+        let (first, second) = (folder(), folder());
+        assert_eq!(first.finish_anyhow(), out);
+        let kept = second.finish_anyhow();
+        assert_eq!(kept, scratch.path().join("out-2"));
+        assert_eq!(fs::read_to_string(kept.join("a")).unwrap(), "1");
+        assert_eq!(fs::read_dir(scratch.path()).unwrap().count(), 2);
     }
 
     #[test]

@@ -1,6 +1,6 @@
-//! `steersman record`: the expert drives, the cameras watch.
+//! `steersman record`: the expert drives, or a person, and the cameras watch.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
 
 use clap::{Args, ValueEnum};
@@ -8,16 +8,24 @@ use clap::{Args, ValueEnum};
 use super::share_bar::ShareBar;
 use super::{pool, print_json, stop_on_ctrl_c};
 use crate::error::Result;
+use crate::live::coverage::Shares;
+use crate::live::{DEFAULT_PORT, ManualDrive};
 use crate::simulator::expert::Style;
-use crate::simulator::recorder::RECORD_HZ;
+use crate::simulator::recorder::{RECORD_HZ, RecordingInfo};
 use crate::simulator::{LogFormat, RecordOptions, Track, record};
 
-/// Record the expert driver in the simulator, in the format of Udacity's simulator
+/// Record the expert driver in the simulator, or with --manual your own driving, in the format of Udacity's simulator
 #[derive(Debug, Args)]
 pub struct RecordArgs {
     /// lake, mountain, coast, forest, random:SEED, or a track file
     #[arg(long)]
     track: String,
+    /// Drive yourself, with keyboard, mouse or gamepad, on a page in a browser of this machine; Ctrl-C ends and saves
+    #[arg(long, conflicts_with_all = ["laps", "recovery", "style", "noise", "threads"])]
+    manual: bool,
+    /// Port of the page, on this machine only; 0 takes any free one
+    #[arg(long, default_value_t = DEFAULT_PORT, requires = "manual")]
+    port: u16,
     /// Laps to drive; with --recovery laps along which the car is put off its line
     #[arg(long, default_value_t = 1.0)]
     laps: f64,
@@ -33,7 +41,7 @@ pub struct RecordArgs {
     /// Draws where the drive begins, its light and its texture
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Speed to hold, mph
+    /// Speed to hold, mph; with --manual the highest
     #[arg(long, default_value_t = 20.0, value_name = "MPH")]
     speed: f64,
     /// Standard deviation of a disturbance of the steering that the labels do not show
@@ -91,6 +99,9 @@ pub fn run(args: RecordArgs) -> Result<()> {
             Format::V2 => LogFormat::V2,
         },
     };
+    if args.manual {
+        return drive_by_hand(&args, &track, &options);
+    }
     let stop = stop_on_ctrl_c()?;
     let bar = ShareBar::new(format!("recording {}", track.name()));
     let progress = |share| {
@@ -102,7 +113,35 @@ pub fn run(args: RecordArgs) -> Result<()> {
     if args.json {
         return print_json(&info);
     }
+    print_rows(&info, &args.out);
+    Ok(())
+}
+
+fn print_rows(info: &RecordingInfo, folder: &Path) {
     let held_out = if info.held_out { ", a track that training must not see" } else { "" };
-    println!("{} rows of {}{held_out} in {}", info.rows, info.track, args.out.display());
+    println!("{} rows of {}{held_out} in {}", info.rows, info.track, folder.display());
+}
+
+/// `record --manual`.
+fn drive_by_hand(args: &RecordArgs, track: &Track, options: &RecordOptions) -> Result<()> {
+    let drive = ManualDrive::prepare(track, options, &args.out, args.port)?;
+    let stop = stop_on_ctrl_c()?;
+    eprintln!("open {} to drive; Ctrl-C, or the button there, ends the drive and saves it", drive.url());
+    let summary = drive.run(&stop)?;
+    if args.json {
+        return print_json(&summary);
+    }
+    let Some(folder) = &summary.folder else {
+        println!("nothing was recorded, so there is no {}", args.out.display());
+        return Ok(());
+    };
+    print_rows(&summary.info, folder);
+    let Shares { minutes, laps, left, right, recovery, .. } = summary.coverage;
+    let [left, straight, right, recovery] =
+        [left, 1.0 - left - right, right, recovery].map(|share| format!("{:.0} %", 100.0 * share));
+    println!("{minutes:.1} minutes, {laps:.1} laps; {left} left, {straight} straight, {right} right; {recovery} ways back");
+    for advice in &summary.advice {
+        println!("{advice}");
+    }
     Ok(())
 }

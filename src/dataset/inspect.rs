@@ -1,6 +1,6 @@
 //! What a recording holds, for `steersman inspect`.
 
-mod advice;
+pub(crate) mod advice;
 mod frames;
 mod lag;
 mod suspicious;

@@ -5,9 +5,9 @@ use super::svg::{Anchor, Svg};
 use crate::simulator::Track;
 
 /// Distance from the line that has the darkest colour, m.
-const DARKEST_M: f64 = 2.0;
+pub(crate) const DARKEST_M: f64 = 2.0;
 /// Steps of colour.
-const COLOURS: usize = 8;
+pub(crate) const COLOURS: usize = 8;
 
 /// A moment of a drive.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -59,7 +59,7 @@ pub fn draw(title: &str, track: Option<&Track>, drives: &[Vec<Place>], size: [f6
 }
 
 /// Right and left edge of the road, closed.
-fn edges(track: &Track) -> Vec<Vec<[f64; 2]>> {
+pub(crate) fn edges(track: &Track) -> Vec<Vec<[f64; 2]>> {
     let around = || track.stations.iter().chain(track.stations.first());
     let edge = |side: f64| {
         around().map(move |s| {
@@ -68,6 +68,11 @@ fn edges(track: &Track) -> Vec<Vec<[f64; 2]>> {
         })
     };
     vec![edge(1.0).collect(), edge(-1.0).collect()]
+}
+
+/// The colour of step `i` of [`COLOURS`], as `#rrggbb`.
+pub(crate) fn colour_hex(i: usize) -> String {
+    heat_hex(0.25 + 0.75 * i as f64 / (COLOURS - 1) as f64)
 }
 
 /// Draws a way in stretches of one colour.
@@ -80,8 +85,7 @@ fn way(svg: &mut Svg, drive: &[Place], place: &impl Fn([f64; 2]) -> [f64; 2]) {
             // The first point of the next stretch joins them, unless the car was lifted there.
             let joined = usize::from(i < drive.len() && !drive[i].put_back);
             let points: Vec<_> = drive[from..i + joined].iter().map(|p| place([p.x, p.y])).collect();
-            let share = 0.25 + 0.75 * colour(&drive[from]) as f64 / (COLOURS - 1) as f64;
-            svg.polyline(&points, &format!("stroke=\"{}\" stroke-width=\"2.6\"", heat_hex(share)));
+            svg.polyline(&points, &format!("stroke=\"{}\" stroke-width=\"2.6\"", colour_hex(colour(&drive[from]))));
             from = i;
         }
     }
@@ -99,8 +103,7 @@ fn way(svg: &mut Svg, drive: &[Place], place: &impl Fn([f64; 2]) -> [f64; 2]) {
 fn legend(svg: &mut Svg, [_, height]: [f64; 2], scale: f64) {
     let y = height - 26.0;
     for i in 0..COLOURS {
-        let share = 0.25 + 0.75 * i as f64 / (COLOURS - 1) as f64;
-        svg.rect([16.0 + 18.0 * i as f64, y - 10.0], [18.0, 10.0], &format!("fill=\"{}\"", heat_hex(share)));
+        svg.rect([16.0 + 18.0 * i as f64, y - 10.0], [18.0, 10.0], &format!("fill=\"{}\"", colour_hex(i)));
     }
     let quiet = format!("fill=\"{QUIET_INK}\"");
     svg.text([16.0, y + 14.0], 12.0, Anchor::Start, &quiet, &format!("0 to {DARKEST_M:.0} m and more from the line"));

@@ -1,13 +1,7 @@
 //! The HTTP request that opens a WebSocket: accepted, or refused with one sentence that names the remedy.
 
-use tungstenite::handshake::derive_accept_key;
-
 use super::protocol::EngineVersion;
-
-/// Longest request, bytes.
-const MAX_HEAD: usize = 8 * 1024;
-/// Most headers of a request.
-const MAX_HEADERS: usize = 64;
+use crate::http::{self, BadHead, Head, is_fixed_name};
 
 /// What is to be done with a client after what it has sent so far.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -50,28 +44,18 @@ impl Client {
 
 /// Reads what has come of a request. `allowed_origins` are those of web pages that may connect; `*` is any.
 pub fn examine(head: &[u8], allowed_origins: &[String]) -> Verdict {
-    let mut headers = [httparse::EMPTY_HEADER; MAX_HEADERS];
-    let mut request = httparse::Request::new(&mut headers);
-    let head_len = match request.parse(head) {
-        Ok(httparse::Status::Complete(len)) => len,
-        Ok(httparse::Status::Partial) if head.len() < MAX_HEAD => return Verdict::Incomplete,
-        Ok(httparse::Status::Partial) => {
-            return refuse("431 Request Header Fields Too Large", "the request is longer than 8 KiB");
-        }
-        Err(_) if head.first() == Some(&0x16) => {
+    let request = match Head::parse(head) {
+        Ok(Some(request)) => request,
+        Ok(None) => return Verdict::Incomplete,
+        Err(BadHead::TooLong) => return refuse("431 Request Header Fields Too Large", "the request is longer than 8 KiB"),
+        Err(BadHead::NotHttp) if head.first() == Some(&0x16) => {
             return refuse("400 Bad Request", "this is TLS; connect with ws:// instead of wss://");
         }
-        Err(_) => return refuse("400 Bad Request", "this is no HTTP request; a Socket.IO client is expected"),
+        Err(BadHead::NotHttp) => {
+            return refuse("400 Bad Request", "this is no HTTP request; a Socket.IO client is expected");
+        }
     };
-    let bytes = |name: &str| {
-        request.headers.iter().find(|header| header.name.eq_ignore_ascii_case(name)).map(|header| header.value)
-    };
-    let header = |name: &str| bytes(name).and_then(|value| std::str::from_utf8(value).ok()).map(str::trim);
-    let has_token = |name: &str, token: &str| {
-        header(name).is_some_and(|value| value.split(',').any(|part| part.trim().eq_ignore_ascii_case(token)))
-    };
-    let target = request.path.unwrap_or("/");
-    let query = target.split_once('?').map_or("", |(_, query)| query);
+    let query = request.target.split_once('?').map_or("", |(_, query)| query);
     let parameter = |name: &str| query.split('&').find_map(|pair| pair.strip_prefix(name)?.strip_prefix('='));
 
     if parameter("transport") == Some("polling") {
@@ -80,44 +64,35 @@ pub fn examine(head: &[u8], allowed_origins: &[String]) -> Verdict {
             "only WebSocket is spoken here: connect with transports=['websocket'] instead of polling",
         );
     }
-    if request.method != Some("GET") || !has_token("upgrade", "websocket") || !has_token("connection", "upgrade") {
+    if request.method != "GET" || !request.wants_websocket() {
         return refuse(
             "400 Bad Request",
             "a WebSocket is expected here: start the simulator in autonomous mode, or connect a Socket.IO client with transports=['websocket']",
         );
     }
-    // One that is no text is still the origin of a page.
-    let origin = bytes("origin").map(String::from_utf8_lossy);
+    let origin = request.origin();
     if let Some(origin) = origin.as_deref().map(str::trim)
-        && !is_allowed(origin, header("host").unwrap_or(""), allowed_origins)
+        && !is_allowed(origin, request.header("host").unwrap_or(""), allowed_origins)
     {
         return refuse(
             "403 Forbidden",
             &format!("web pages of {} may not connect; --allow-origin allows it", printable(origin)),
         );
     }
-    if header("sec-websocket-version") != Some("13") {
-        return refuse("426 Upgrade Required\r\nSec-WebSocket-Version: 13", "version 13 of WebSocket is expected");
-    }
-    let Some(key) = header("sec-websocket-key").filter(|key| !key.is_empty()) else {
-        return refuse("400 Bad Request", "the header Sec-WebSocket-Key is missing");
-    };
     // No extension and no subprotocol: the simulator closes the connection if it is offered one.
-    let response = format!(
-        "HTTP/1.1 101 Switching Protocols\r\nUpgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Accept: {}\r\n\r\n",
-        derive_accept_key(key.as_bytes())
-    );
+    let response = match request.accept_websocket() {
+        Ok(response) => response,
+        Err((status, reason)) => return refuse(status, reason),
+    };
     let version = if parameter("EIO") == Some("4") { EngineVersion::V4 } else { EngineVersion::V3 };
-    let agent = printable(header("user-agent").unwrap_or(""));
-    Verdict::Accept { response, head_len, client: Client { agent, version } }
+    let agent = printable(request.header("user-agent").unwrap_or(""));
+    Verdict::Accept { response, head_len: request.len, client: Client { agent, version } }
 }
 
 /// Whether a page of `origin` may connect. Some libraries name the server itself, which no page can do: this server has no
 /// pages, and an address made of digits cannot be redirected to it.
 fn is_allowed(origin: &str, host: &str, allowed: &[String]) -> bool {
-    let name = host.rsplit_once(':').map_or(host, |(name, _)| name);
-    let fixed = name == "localhost" || name.trim_matches(['[', ']']).parse::<std::net::IpAddr>().is_ok();
-    let own = fixed && origin.strip_prefix("http://") == Some(host);
+    let own = is_fixed_name(host) && origin.strip_prefix("http://") == Some(host);
     own || allowed.iter().any(|allowed| allowed == "*" || allowed.trim_end_matches('/') == origin)
 }
 
@@ -127,10 +102,7 @@ fn printable(value: &str) -> String {
 }
 
 fn refuse(status: &str, reason: &str) -> Verdict {
-    let response = format!(
-        "HTTP/1.1 {status}\r\nContent-Type: text/plain; charset=utf-8\r\nContent-Length: {}\r\nConnection: close\r\n\r\n{reason}\n",
-        reason.len() + 1
-    );
+    let response = http::plain(status, reason);
     Verdict::Refuse { response, reason: reason.into() }
 }
 

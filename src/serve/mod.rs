@@ -42,7 +42,7 @@ pub mod recording;
 mod registry;
 pub mod seat;
 mod server;
-mod socket;
+pub(crate) mod socket;
 pub mod tokens;
 
 pub use helm::HelmOptions;

@@ -20,6 +20,7 @@ use super::recording::{Recorded, Recorder};
 use super::registry::Registry;
 use super::seat::Seat;
 use crate::error::{Error, Result};
+use crate::http;
 use crate::pilot::Pilot;
 
 /// Connections that are kept at once.
@@ -169,20 +170,8 @@ impl Server {
     /// [`Error::Usage`] with the remedy if the address cannot be had or the folder exists.
     pub fn bind(options: ServerOptions) -> Result<Server> {
         let address = options.address;
-        let listener = TcpListener::bind(address).map_err(|error| {
-            let remedy = match error.kind() {
-                std::io::ErrorKind::AddrInUse => {
-                    "another program has this port: end it (is drive.py still running?) or give --port"
-                }
-                std::io::ErrorKind::PermissionDenied => "give a --port of 1024 or more",
-                std::io::ErrorKind::AddrNotAvailable => {
-                    "give this machine's own address with --host, or 0.0.0.0 for all"
-                }
-                _ => "give another --host or --port",
-            };
-            Error::Usage(format!("cannot listen at {address}: {error}; {remedy}"))
-        })?;
-        listener.set_nonblocking(true).map_err(|e| Error::Usage(format!("cannot listen at {address}: {e}")))?;
+        let in_use = "end it (is drive.py still running?) or give --port";
+        let listener = http::listen(address, in_use)?;
         let recorder = options.record.as_deref().map(Recorder::start).transpose()?;
         Ok(Server { listener, options, recorder })
     }

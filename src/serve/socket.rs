@@ -10,7 +10,7 @@ const WRITE_TIMEOUT: Duration = Duration::from_secs(1);
 /// A connection's stream. Reading returns `WouldBlock` once in each beat, however slowly bytes trickle in, so that whoever
 /// reads can look after its deadlines.
 #[derive(Debug)]
-pub(super) struct Socket {
+pub(crate) struct Socket {
     stream: TcpStream,
     last_byte: Instant,
     beat: Duration,
@@ -93,7 +93,7 @@ impl Socket {
 }
 
 /// Whether an error only says that nothing has come yet.
-pub(super) fn is_timeout(error: &io::Error) -> bool {
+pub(crate) fn is_timeout(error: &io::Error) -> bool {
     matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted)
 }
 

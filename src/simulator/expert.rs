@@ -1,6 +1,7 @@
 //! The expert: pure pursuit of the reference line, and the same driver with a keyboard.
 
 use super::car::{MAX_STEER_DEG, REAR_AXLE_M, STEP_S, WHEELBASE_M};
+use super::keys;
 use super::math::atan;
 use super::simulation::Simulation;
 
@@ -48,8 +49,7 @@ pub enum Style {
 
 /// Turns wanted steering into what a driver with two keys makes of it.
 ///
-/// A held key moves the wheel by 0.05 a step; released, the wheel returns at 3 a second. The driver presses when what is
-/// still missing has added up, and lets go when it is made good.
+/// The wheel moves as [`keys::wheel`] tells. The driver presses when what is still missing has added up, and lets go when it is made good.
 #[derive(Clone, Debug, Default)]
 pub struct Keyboard {
     wheel: f64,
@@ -74,12 +74,7 @@ impl Keyboard {
         } else if self.missing * self.pressed < 0.006 {
             self.pressed = 0.0;
         }
-        if self.pressed != 0.0 {
-            self.wheel = (self.wheel + 0.05 * self.pressed).clamp(-1.0, 1.0);
-        } else {
-            let back = 3.0 * STEP_S;
-            self.wheel = if self.wheel.abs() <= back { 0.0 } else { self.wheel - back.copysign(self.wheel) };
-        }
+        self.wheel = keys::wheel(self.wheel, self.pressed);
         self.wheel
     }
 }

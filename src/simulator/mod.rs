@@ -14,6 +14,7 @@ pub mod drive;
 pub mod expert;
 pub mod eye;
 pub mod jpeg;
+pub mod keys;
 pub mod light;
 pub mod math;
 pub mod noise;
@@ -32,6 +33,7 @@ pub mod statistics;
 mod terrain;
 pub mod track;
 mod world;
+pub mod writer;
 
 pub use camera::{BodyPose, Camera, HEIGHT, Mount, RgbFrame, WIDTH};
 pub use closed_loop::ClosedLoop;

@@ -1,26 +1,25 @@
 //! Records drives of the expert in the format of Udacity's simulator.
 
 use std::fs;
-use std::io::{self, Write as _};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use rayon::prelude::*;
 use serde::Serialize;
 
-use super::camera::{BodyPose, Camera, Mount, RgbFrame};
+use super::camera::BodyPose;
 use super::car::{Controls, MPS_PER_MPH, STEP_S, STEPS_PER_S};
 use super::expert::{Keyboard, Style, pursuit};
 use super::eye::Eye;
-use super::jpeg;
 use super::light::Variant;
 use super::math::Rng;
 use super::noise::SteeringNoise;
-use super::renderer::Renderer;
 use super::run::{DRIVE_HZ, DriveState, Driver};
 use super::simulation::{Simulation, Start};
 use super::speed::SpeedController;
 use super::track::Track;
+pub use super::writer::Sample;
+use super::writer::{LogLines, Photographer};
 use crate::new_folder::NewFolder;
 use crate::{Error, Result};
 
@@ -60,6 +59,22 @@ pub struct RecordOptions {
     pub format: LogFormat,
 }
 
+impl RecordOptions {
+    /// Checks what any driver is bound to: speed and rows a second.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] with what would be possible.
+    pub fn check(&self) -> Result<()> {
+        if !(5.0..=30.0).contains(&self.speed_mph) {
+            return Err(Error::Usage(format!("speed {} mph: 5 to 30 mph can be recorded", self.speed_mph)));
+        }
+        if self.hz == 0 || !STEPS_PER_S.is_multiple_of(self.hz) {
+            return Err(Error::Usage(format!("{} rows a second: 1, 2, 5, 10, 25 or 50 can be recorded", self.hz)));
+        }
+        Ok(())
+    }
+}
+
 impl Default for RecordOptions {
     fn default() -> Self {
         RecordOptions {
@@ -76,23 +91,6 @@ impl Default for RecordOptions {
     }
 }
 
-/// One row of the log before its pictures are taken.
-#[derive(Clone, Debug)]
-pub struct Sample {
-    /// Simulated time, s.
-    pub time_s: f64,
-    /// The car.
-    pub body: BodyPose,
-    /// Label: steering, [-1, 1], + = right.
-    pub steering: f64,
-    /// Throttle, 0 to 1.
-    pub throttle: f64,
-    /// Brake, 0 to 1.
-    pub brake: f64,
-    /// Speed, mph.
-    pub speed_mph: f64,
-}
-
 /// What a recording is, beside the log.
 #[derive(Clone, Debug, Serialize)]
 pub struct RecordingInfo {
@@ -102,15 +100,15 @@ pub struct RecordingInfo {
     pub held_out: bool,
     /// Seed of the recording.
     pub seed: u64,
-    /// Laps asked for.
+    /// Laps asked for; laps driven, if by hand.
     pub laps: f64,
     /// Driven against the direction of the track's points.
     pub reverse: bool,
     /// Only ways back to the line.
     pub recovery: bool,
-    /// `smooth` or `keyboard`.
+    /// `smooth` or `keyboard`; `manual` if a person drove.
     pub style: String,
-    /// Speed held, mph.
+    /// Speed held, mph; the highest, if by hand.
     pub speed_mph: f64,
     /// Disturbance of the steering.
     pub noise: f64,
@@ -118,6 +116,35 @@ pub struct RecordingInfo {
     pub hz: u64,
     /// Rows of the log.
     pub rows: usize,
+}
+
+impl RecordingInfo {
+    /// What is said of `rows` rows that were driven as `options` ask for.
+    pub fn new(track: &Track, options: &RecordOptions, rows: usize) -> RecordingInfo {
+        RecordingInfo {
+            track: track.name().to_string(),
+            held_out: track.held_out(),
+            seed: options.seed,
+            laps: options.laps,
+            reverse: options.reverse,
+            recovery: options.recovery,
+            style: if options.style == Style::Keyboard { "keyboard" } else { "smooth" }.to_string(),
+            speed_mph: options.speed_mph,
+            noise: options.noise,
+            hz: options.hz,
+            rows,
+        }
+    }
+
+    /// Writes `recording.toml` into `folder`.
+    ///
+    /// # Errors
+    /// If it cannot be written.
+    pub fn write(&self, folder: &Path) -> Result<()> {
+        let side = folder.join("recording.toml");
+        let text = toml::to_string(self).map_err(|e| Error::data(&side, e.to_string()))?;
+        fs::write(&side, text).map_err(Error::io(&side))
+    }
 }
 
 /// The expert driving for a recording.
@@ -280,12 +307,7 @@ pub fn record(
     if !(options.laps > 0.0 && options.laps <= 1000.0) {
         return Err(Error::Usage(format!("laps {}: more than 0 and at most 1000 can be recorded", options.laps)));
     }
-    if !(5.0..=30.0).contains(&options.speed_mph) {
-        return Err(Error::Usage(format!("speed {} mph: 5 to 30 mph can be recorded", options.speed_mph)));
-    }
-    if options.hz == 0 || !STEPS_PER_S.is_multiple_of(options.hz) {
-        return Err(Error::Usage(format!("{} rows a second: 1, 2, 5, 10, 25 or 50 can be recorded", options.hz)));
-    }
+    options.check()?;
     let samples = drive_expert(track, options);
     write_recording(track, options, &samples, out, progress)
 }
@@ -321,83 +343,24 @@ fn fill(
     let world = track.world();
     let variant = Variant::new(world, options.seed);
     let done = AtomicUsize::new(0);
-    samples.par_iter().try_for_each_init(
-        || (Renderer::default(), RgbFrame::default(), Vec::new()),
-        |(renderer, frame, bytes), sample| {
-            for mount in Mount::ALL {
-                renderer.render(world, &variant, &Camera::new(&sample.body, mount), mount, frame);
-                bytes.clear();
-                jpeg::encode(frame, bytes)?;
-                let path = images.join(image_name(mount, sample.time_s));
-                fs::write(&path, &bytes).map_err(Error::io(&path))?;
-            }
-            let count = done.fetch_add(1, Ordering::Relaxed) + 1;
-            if progress(count as f64 / samples.len() as f64) { Ok(()) } else { Err(Error::Interrupted) }
-        },
-    )?;
+    samples.par_iter().try_for_each_init(Photographer::default, |photographer, sample| {
+        photographer.take(world, &variant, sample, &images)?;
+        let count = done.fetch_add(1, Ordering::Relaxed) + 1;
+        if progress(count as f64 / samples.len() as f64) { Ok(()) } else { Err(Error::Interrupted) }
+    })?;
     let log = folder.unfinished().join("driving_log.csv");
-    log_text(out, samples, options.format).and_then(|text| fs::write(&log, text)).map_err(Error::io(&log))?;
-    let info = RecordingInfo {
-        track: track.name().to_string(),
-        held_out: track.held_out(),
-        seed: options.seed,
-        laps: options.laps,
-        reverse: options.reverse,
-        recovery: options.recovery,
-        style: if options.style == Style::Keyboard { "keyboard" } else { "smooth" }.to_string(),
-        speed_mph: options.speed_mph,
-        noise: options.noise,
-        hz: options.hz,
-        rows: samples.len(),
-    };
-    let side = folder.unfinished().join("recording.toml");
-    let text = toml::to_string(&info).map_err(|e| Error::data(&side, e.to_string()))?;
-    fs::write(&side, text).map_err(Error::io(&side))?;
+    let lines = LogLines::new(options.format, out)?;
+    let mut text = lines.header().as_bytes().to_vec();
+    let rows = samples.iter().try_for_each(|sample| lines.row(sample, &mut text));
+    rows.and_then(|()| fs::write(&log, text)).map_err(Error::io(&log))?;
+    let info = RecordingInfo::new(track, options, samples.len());
+    info.write(folder.unfinished())?;
     Ok(info)
-}
-
-/// Name of a picture taken `time_s` after noon of 1 January 2026, the simulator's fixed date.
-fn image_name(mount: Mount, time_s: f64) -> String {
-    let ms = (time_s * 1000.0).round() as u64 + 12 * 3_600_000;
-    let (day, ms) = (1 + ms / 86_400_000, ms % 86_400_000);
-    let (hour, minute, second) = (ms / 3_600_000, ms / 60_000 % 60, ms / 1000 % 60);
-    format!("{}_2026_01_{day:02}_{hour:02}_{minute:02}_{second:02}_{:03}.jpg", mount.name(), ms % 1000)
-}
-
-/// The log of a recording in the folder `out`.
-fn log_text(out: &Path, samples: &[Sample], format: LogFormat) -> io::Result<Vec<u8>> {
-    let (separator, folder) = match format {
-        LogFormat::Sample => (", ", PathBuf::from("IMG")),
-        LogFormat::V2 => (",", std::path::absolute(out)?.join("IMG")),
-    };
-    let mut text = Vec::new();
-    if format == LogFormat::Sample {
-        writeln!(text, "center,left,right,steering,throttle,brake,speed")?;
-    }
-    for sample in samples {
-        for mount in Mount::ALL {
-            let name = image_name(mount, sample.time_s);
-            match format {
-                LogFormat::Sample => write!(text, "IMG/{name}{separator}")?,
-                LogFormat::V2 => write!(text, "{}{separator}", folder.join(name).display())?,
-            }
-        }
-        let numbers =
-            [sample.steering, sample.throttle, sample.brake, sample.speed_mph].map(|v| (v as f32).to_string());
-        writeln!(text, "{}", numbers.join(separator))?;
-    }
-    Ok(text)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn names_carry_simulated_time() {
-        assert_eq!(image_name(Mount::Left, 0.1), "left_2026_01_01_12_00_00_100.jpg");
-        assert_eq!(image_name(Mount::Center, 43_261.02), "center_2026_01_02_00_01_01_020.jpg");
-    }
 
     #[test]
     fn a_lap_is_sampled_at_ten_hertz_and_holds_the_speed() {

@@ -5,17 +5,17 @@ use super::{Pictures, Report, Steering};
 use crate::dataset::recording::{Camera, Kind, Reason};
 
 /// Share of labels that are exactly zero above which straight frames crowd out the bends.
-const MANY_ZEROS: f64 = 0.35;
+pub(crate) const MANY_ZEROS: f64 = 0.35;
 /// Share of zeros that the advised thinning leaves.
 const ZEROS_LEFT: f64 = 1.0 / 3.0;
 /// Turns to one side are rare below this share of all turns.
-const RARE_SIDE: f64 = 0.25;
+pub(crate) const RARE_SIDE: f64 = 0.25;
 /// Share of labels at full lock above which driving was jerky.
-const MUCH_FULL_LOCK: f64 = 0.05;
+pub(crate) const MUCH_FULL_LOCK: f64 = 0.05;
 /// Labels of a keyboard take fewer different values than this share of the rows.
 const FEW_LABELS: f64 = 0.02;
 /// Below this number of rows, networks learn the road by heart.
-const FEW_ROWS: usize = 5000;
+pub(crate) const FEW_ROWS: usize = 5000;
 /// Share of standing rows that is worth a word.
 const MUCH_STANDING: f64 = 0.01;
 /// A picture follows its label by this much, in milliseconds, where both belong together.

@@ -1,0 +1,314 @@
+//! The page and its WebSocket, on this machine only.
+
+use std::io::{Read as _, Write as _};
+use std::net::{Ipv4Addr, SocketAddr, TcpListener, TcpStream};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use tungstenite::protocol::{Role, WebSocketConfig};
+use tungstenite::{Message, WebSocket};
+
+use super::controls::Wheel;
+use super::hub::Hub;
+use super::messages::{Farewell, Hello, Request, State};
+use crate::error::{Error, Result};
+use crate::http::{self, BadHead, Head};
+use crate::serve::socket::{Socket, is_timeout};
+
+/// Port of the page, unless told otherwise.
+pub const DEFAULT_PORT: u16 = 4568;
+/// The page, whole.
+const PAGE: &str = include_str!("page.html");
+/// The path of the WebSocket.
+const SOCKET_PATH: &str = "/live";
+/// Nothing is loaded from elsewhere, and no other page may show this one in a frame and have its buttons pressed.
+const HEADERS: &str = "Content-Security-Policy: default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; \
+    img-src data:; connect-src 'self' ws://127.0.0.1:* ws://localhost:*; base-uri 'none'; form-action 'none'; \
+    frame-ancestors 'none'\r\nX-Frame-Options: DENY\r\nX-Content-Type-Options: nosniff\r\nReferrer-Policy: no-referrer\r\n\
+    Cache-Control: no-store\r\n";
+/// Connections that are kept at once.
+const MAX_CONNECTIONS: usize = 32;
+/// Time for a whole request.
+const REQUEST_TIME: Duration = Duration::from_secs(5);
+/// Time that a browser has to read the last words.
+const FAREWELL: Duration = Duration::from_millis(300);
+/// Pause between looks at the listener.
+const LISTEN_PAUSE: Duration = Duration::from_millis(5);
+/// Beat of a connection that waits for a frame; the most that a frame is late.
+const QUICK_BEAT: Duration = Duration::from_millis(4);
+/// Beat of one that has time.
+const SLOW_BEAT: Duration = Duration::from_millis(40);
+/// Largest message of a page, bytes.
+const MAX_MESSAGE: usize = 4096;
+/// Stack of a connection's thread, bytes.
+const STACK: usize = 1 << 20;
+
+/// A page that is being served, in threads of its own, until it is dropped.
+#[derive(Debug)]
+pub struct Live {
+    hub: Arc<Hub>,
+    address: SocketAddr,
+    listener: Option<JoinHandle<()>>,
+}
+
+impl Live {
+    /// Serves the page at `port` of loopback; 0 takes any free one. `by_hand` lets a person drive with it.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Usage`] with the remedy if the port cannot be had.
+    pub fn start(port: u16, hello: Hello, by_hand: bool) -> Result<Live> {
+        let in_use = "end it, or give another --port; 0 takes any free one";
+        let listener = http::listen(SocketAddr::from((Ipv4Addr::LOCALHOST, port)), in_use)?;
+        let fault = |e: std::io::Error| Error::Usage(format!("cannot serve the page: {e}"));
+        let address = listener.local_addr().map_err(fault)?;
+        let hub = Arc::new(Hub::new(hello, by_hand));
+        let shared = hub.clone();
+        let thread = std::thread::Builder::new().name("live".into());
+        let listener = thread.spawn(move || listen(&listener, address.port(), &shared)).map_err(fault)?;
+        Ok(Live { hub, address, listener: Some(listener) })
+    }
+
+    /// What to open in a browser.
+    pub fn url(&self) -> String {
+        format!("http://{}/", self.address)
+    }
+
+    /// Pages that are open.
+    pub fn viewers(&self) -> usize {
+        self.hub.viewers()
+    }
+
+    /// Draws the car's way on. Cheap, and wanted even while nobody looks on: who comes late sees the whole way.
+    pub fn trace(&self, state: &State) {
+        self.hub.trace(state);
+    }
+
+    /// Shows a frame: JPEGs of the camera and, or empty, of the same with saliency.
+    pub fn publish(&self, state: &State, camera: &[u8], saliency: &[u8]) {
+        self.hub.publish(state, camera, saliency);
+    }
+
+    /// Looks at the wheel, where a person may drive.
+    pub fn with_wheel<T>(&self, look: impl FnOnce(&mut Wheel) -> T) -> Option<T> {
+        self.hub.wheel().map(|mut wheel| look(&mut wheel))
+    }
+
+    /// Tells every page how it ended, and closes.
+    pub fn finish(mut self, words: &str) {
+        self.close(words);
+    }
+
+    fn close(&mut self, words: &str) {
+        self.hub.end(words);
+        if let Some(listener) = self.listener.take() {
+            // If it panicked it has ended, too.
+            let _ = listener.join();
+        }
+    }
+}
+
+impl Drop for Live {
+    fn drop(&mut self) {
+        self.close("The program has ended.");
+    }
+}
+
+/// Accepts connections until the end, and waits for theirs.
+fn listen(listener: &TcpListener, port: u16, hub: &Hub) {
+    let open = AtomicUsize::new(0);
+    std::thread::scope(|scope| {
+        let mut id = 0;
+        while hub.over().is_none() {
+            let Ok((stream, _)) = listener.accept() else {
+                // Nobody there, or the connection is gone already, or the process has no file left for it.
+                std::thread::sleep(LISTEN_PAUSE);
+                continue;
+            };
+            if open.load(Ordering::Relaxed) >= MAX_CONNECTIONS {
+                continue;
+            }
+            id += 1;
+            open.fetch_add(1, Ordering::Relaxed);
+            let open = &open;
+            let thread = std::thread::Builder::new().name(format!("viewer {id}")).stack_size(STACK);
+            let serve = move || {
+                // A connection that fails is gone; the browser opens another.
+                let _ = catch_unwind(AssertUnwindSafe(|| serve(stream, id, port, hub)));
+                open.fetch_sub(1, Ordering::Relaxed);
+            };
+            if thread.spawn_scoped(scope, serve).is_err() {
+                open.fetch_sub(1, Ordering::Relaxed);
+            }
+        }
+    });
+}
+
+/// Answers one request. Errors end the connection, and nobody is left to hear of them.
+fn serve(stream: TcpStream, id: u64, port: u16, hub: &Hub) -> std::io::Result<()> {
+    let mut socket = Socket::new(stream, SLOW_BEAT)?;
+    let began = Instant::now();
+    let mut bytes = Vec::with_capacity(1024);
+    while began.elapsed() < REQUEST_TIME && hub.over().is_none() {
+        let mut chunk = [0; 1024];
+        socket.begin_beat();
+        match socket.read(&mut chunk) {
+            Ok(0) => return Ok(()),
+            Ok(len) => bytes.extend_from_slice(&chunk[..len]),
+            Err(error) if is_timeout(&error) => continue,
+            Err(error) => return Err(error),
+        }
+        let answer = match Head::parse(&bytes) {
+            Ok(None) => continue,
+            Ok(Some(head)) => answer(&head, port),
+            Err(BadHead::TooLong) => {
+                Answer::Say(http::plain("431 Request Header Fields Too Large", "the request is longer than 8 KiB"))
+            }
+            Err(BadHead::NotHttp) => Answer::Say(http::plain("400 Bad Request", "this is no HTTP request")),
+        };
+        return match answer {
+            Answer::Say(response) => {
+                socket.write_all(response.as_bytes())?;
+                socket.finish(FAREWELL);
+                Ok(())
+            }
+            Answer::Open { response, len } => {
+                socket.write_all(response.as_bytes())?;
+                show(socket, bytes[len..].to_vec(), id, hub);
+                Ok(())
+            }
+        };
+    }
+    Ok(())
+}
+
+/// What a request gets.
+enum Answer {
+    /// The whole answer; the connection is closed then.
+    Say(String),
+    /// A WebSocket after the `len` bytes of the request.
+    Open { response: String, len: usize },
+}
+
+fn answer(head: &Head, port: u16) -> Answer {
+    let refuse = |status: &str, sentence: &str| Answer::Say(http::plain(status, sentence));
+    let own = [format!("127.0.0.1:{port}"), format!("localhost:{port}")];
+    let is_own = |host: &str| own.iter().any(|own| own.eq_ignore_ascii_case(host));
+    let Some(host) = head.header("host").filter(|host| is_own(host)) else {
+        return refuse("403 Forbidden", &format!("this page is served as http://{}/ only", own[0]));
+    };
+    let path = head.target.split('?').next().unwrap_or("");
+    if path != "/" && path != SOCKET_PATH {
+        return refuse("404 Not Found", "there is one page here, /");
+    }
+    if head.method != "GET" {
+        return refuse("405 Method Not Allowed\r\nAllow: GET", "only GET is understood here");
+    }
+    if path == "/" {
+        return Answer::Say(http::response("200 OK", "text/html; charset=utf-8", HEADERS, PAGE));
+    }
+    if head.origin().is_some_and(|origin| origin.trim() != format!("http://{host}")) {
+        return refuse("403 Forbidden", "only the page that is served here may connect");
+    }
+    if !head.wants_websocket() {
+        return refuse("426 Upgrade Required\r\nUpgrade: websocket", "a WebSocket is expected here");
+    }
+    match head.accept_websocket() {
+        Ok(response) => Answer::Open { response, len: head.len },
+        Err((status, sentence)) => refuse(status, sentence),
+    }
+}
+
+/// Shows the drive to one page until either ends.
+fn show(socket: Socket, rest: Vec<u8>, id: u64, hub: &Hub) {
+    let config = WebSocketConfig::default()
+        .read_buffer_size(MAX_MESSAGE)
+        .write_buffer_size(0)
+        .max_message_size(Some(MAX_MESSAGE))
+        .max_frame_size(Some(MAX_MESSAGE));
+    let mut socket = WebSocket::from_partially_read(socket, rest, Role::Server, Some(config));
+    let viewer = hub.enter(id);
+    // A page that cannot be talked to any more is gone.
+    let shown = frames(&mut socket, id, hub);
+    drop(viewer);
+    if shown.is_ok()
+        && let Some(words) = hub.over()
+    {
+        let farewell = Farewell { over: words.into() };
+        let text = serde_json::to_string(&farewell).expect("a sentence can be written as JSON");
+        let _ = socket.send(Message::text(text));
+    }
+    let _ = socket.close(None);
+    let _ = socket.flush();
+    socket.get_mut().finish(FAREWELL);
+}
+
+/// Sends a frame whenever the page has asked for one and there is a new one.
+fn frames(socket: &mut WebSocket<Socket>, id: u64, hub: &Hub) -> tungstenite::Result<()> {
+    socket.send(Message::text(hub.opening(id)))?;
+    let (mut seen, mut wanted) = (0, false);
+    while hub.over().is_none() {
+        socket.get_mut().set_beat(if wanted { QUICK_BEAT } else { SLOW_BEAT })?;
+        socket.get_mut().begin_beat();
+        match socket.read() {
+            Ok(Message::Text(text)) => match serde_json::from_str(&text) {
+                Ok(Request::Next) => wanted = true,
+                Ok(request) => hub.request(id, request),
+                Err(_) => return Err(tungstenite::Error::ConnectionClosed),
+            },
+            Ok(Message::Close(_)) => return Err(tungstenite::Error::ConnectionClosed),
+            Ok(_) => {}
+            Err(tungstenite::Error::Io(error)) if is_timeout(&error) => {}
+            Err(error) => return Err(error),
+        }
+        if wanted && let Some((number, message)) = hub.newer_than(seen) {
+            socket.send(Message::Binary(message))?;
+            (seen, wanted) = (number, false);
+        }
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn status(request: &str) -> u16 {
+        let head = Head::parse(request.as_bytes()).unwrap().unwrap();
+        let (Answer::Say(response) | Answer::Open { response, .. }) = answer(&head, 4568);
+        response.split(' ').nth(1).unwrap().parse().unwrap()
+    }
+
+    #[test]
+    fn the_page_loads_nothing_from_elsewhere() {
+        assert!(PAGE.starts_with("<!doctype html>"));
+        for elsewhere in ["http:", "https:", "src=\"", "@import", "url("] {
+            assert!(!PAGE.contains(elsewhere), "{elsewhere}");
+        }
+    }
+
+    #[test]
+    fn only_the_own_page_of_this_machine_is_answered() {
+        let get = |path: &str, host: &str| status(&format!("GET {path} HTTP/1.1\r\nHost: {host}\r\n\r\n"));
+        assert_eq!((get("/", "127.0.0.1:4568"), get("/?x=1", "LOCALHOST:4568")), (200, 200));
+        for host in ["evil.example:4568", "127.0.0.1", "127.0.0.1:80", "localhost.evil.example:4568", ""] {
+            assert_eq!(get("/", host), 403, "{host}");
+        }
+        assert_eq!(status("GET / HTTP/1.1\r\n\r\n"), 403);
+        assert_eq!((get("/../etc/passwd", "localhost:4568"), get("/live", "localhost:4568")), (404, 426));
+        assert_eq!(status("POST / HTTP/1.1\r\nHost: localhost:4568\r\n\r\n"), 405);
+        let socket = |origin: &str| {
+            status(&format!(
+                "GET /live HTTP/1.1\r\nHost: localhost:4568\r\n{origin}Upgrade: websocket\r\nConnection: Upgrade\r\n\
+                 Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
+            ))
+        };
+        assert_eq!((socket(""), socket("Origin: http://localhost:4568\r\n")), (101, 101));
+        for origin in ["null", "http://evil.example", "http://127.0.0.1:4568", "https://localhost:4568"] {
+            assert_eq!(socket(&format!("Origin: {origin}\r\n")), 403, "{origin}");
+        }
+    }
+}
