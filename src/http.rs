@@ -80,10 +80,7 @@ impl<'a> Head<'a> {
     /// refusal.
     pub fn accept_websocket(&self) -> Result<String, (&'static str, &'static str)> {
         if self.header("sec-websocket-version") != Some("13") {
-            return Err((
-                "426 Upgrade Required\r\nSec-WebSocket-Version: 13",
-                "version 13 of WebSocket is expected",
-            ));
+            return Err(("426 Upgrade Required\r\nSec-WebSocket-Version: 13", "version 13 of WebSocket is expected"));
         }
         let Some(key) = self.header("sec-websocket-key").filter(|key| !key.is_empty()) else {
             return Err(("400 Bad Request", "the header Sec-WebSocket-Key is missing"));
@@ -151,7 +148,8 @@ mod tests {
 
     #[test]
     fn a_request_is_read_whatever_the_case_of_its_headers() {
-        let text = b"GET /a?b=c HTTP/1.1\r\nhOST: x\r\nUPGRADE: WebSocket\r\nConnection: keep-alive, Upgrade\r\n\r\nrest";
+        let text =
+            b"GET /a?b=c HTTP/1.1\r\nhOST: x\r\nUPGRADE: WebSocket\r\nConnection: keep-alive, Upgrade\r\n\r\nrest";
         let head = Head::parse(text).unwrap().unwrap();
         assert_eq!((head.method, head.target, head.len), ("GET", "/a?b=c", text.len() - 4));
         assert_eq!((head.header("Host"), head.header("Cookie")), (Some("x"), None));

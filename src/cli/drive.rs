@@ -10,11 +10,15 @@ use super::share_bar::ShareBar;
 use super::{pool, print_json, stop_on_ctrl_c};
 use crate::dataset::held_out::trained_on_held_out;
 use crate::error::Result;
+use crate::live::messages::Hello;
+use crate::live::{DEFAULT_PORT, Live, Watch};
 use crate::new_folder::NewFolder;
 use crate::pilot::Pilot;
 use crate::simulator::drive::write_trajectories;
 use crate::simulator::statistics::PairedTest;
-use crate::simulator::{DriveOptions, DriveResult, DriveSummary, Driver, Expert, Speed, Track, Zero, compare, drive};
+use crate::simulator::{
+    DriveOptions, DriveResult, DriveSummary, Driver, Expert, Speed, Track, Zero, compare, drive, drive_observed,
+};
 
 /// Let a model drive in the simulator and measure how well
 #[derive(Debug, Args)]
@@ -48,6 +52,12 @@ pub struct DriveArgs {
     /// Save the trajectories as csv files; the folder must not exist
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
+    /// Show the runs, one after the other and in real time, on a page in a browser of this machine
+    #[arg(long)]
+    watch: bool,
+    /// Port of the page; 0 takes any free one
+    #[arg(long, default_value_t = DEFAULT_PORT, requires = "watch")]
+    port: u16,
     /// Threads; 0 is one for each core
     #[arg(long, default_value_t = 0)]
     threads: usize,
@@ -83,14 +93,26 @@ pub fn run(args: DriveArgs) -> Result<()> {
     let against = args.against.as_deref().map(Wheel::find).transpose()?;
     // What cannot be created is told before minutes are spent.
     let folder = args.out.as_deref().map(NewFolder::create).transpose()?;
+    let hello = || Hello::new("watch", format!("at the wheel: {}", args.model), &track);
+    let live = args.watch.then(|| Live::start(args.port, hello(), false)).transpose()?;
     let stop = stop_on_ctrl_c()?;
+    if let Some(live) = &live {
+        eprintln!("open {} to watch", live.url());
+    }
     let pool = pool(args.threads)?;
-    let go = |wheel: &Wheel, name: &str| pool.install(|| wheel.drive(&track, &options, name, &stop));
+    let go = |wheel: &Wheel, name: &str| pool.install(|| wheel.drive(&track, &options, name, live.as_ref(), &stop));
     let result = go(&at_wheel, &args.model)?;
     let other = match (&against, &args.against) {
         (Some(wheel), Some(name)) => Some(go(wheel, name)?),
         _ => None,
     };
+    if let Some(live) = live {
+        let DriveSummary { laps_completed, laps_total, autonomy_percent, cte_mean_m, .. } = &result.summary;
+        live.finish(&format!(
+            "The drive is over: {laps_completed} of {laps_total} laps completed, autonomy {autonomy_percent:.1} %, on average \
+             {cte_mean_m:.2} m off the middle."
+        ));
+    }
     let comparison = other.as_ref().map_or(Ok(Vec::new()), |other| compare(&result, other))?;
     // What was measured is told even if it cannot be saved.
     let saved = folder.map_or(Ok(()), |folder| write_trajectories(&result, folder));
@@ -138,7 +160,14 @@ impl Wheel {
         })
     }
 
-    fn drive(&self, track: &Track, options: &DriveOptions, name: &str, stop: &AtomicBool) -> Result<DriveResult> {
+    fn drive(
+        &self,
+        track: &Track,
+        options: &DriveOptions,
+        name: &str,
+        live: Option<&Live>,
+        stop: &AtomicBool,
+    ) -> Result<DriveResult> {
         let new_driver = || -> Result<Box<dyn Driver>> {
             Ok(match self {
                 Wheel::Expert => Box::new(Expert),
@@ -146,12 +175,17 @@ impl Wheel {
                 Wheel::Model(pilot) => pilot.clone(),
             })
         };
-        let bar = ShareBar::new(format!("{name} on {}", track.name()));
-        let progress = |share| {
-            bar.set(share);
-            !stop.load(Ordering::Relaxed)
+        let mut result = if let Some(live) = live {
+            let pilot = if let Wheel::Model(pilot) = self { Some(&**pilot) } else { None };
+            drive_observed(track, new_driver, options, &mut Watch::new(live, name, pilot, options.runs, stop))?
+        } else {
+            let bar = ShareBar::new(format!("{name} on {}", track.name()));
+            let progress = |share| {
+                bar.set(share);
+                !stop.load(Ordering::Relaxed)
+            };
+            drive(track, new_driver, options, &progress)?
         };
-        let mut result = drive(track, new_driver, options, &progress)?;
         if let Wheel::Model(pilot) = self {
             result.summary.trained_on_held_out = pilot.trained_on_held_out().to_vec();
         }

@@ -139,7 +139,9 @@ fn drive_by_hand(args: &RecordArgs, track: &Track, options: &RecordOptions) -> R
     let Shares { minutes, laps, left, right, recovery, .. } = summary.coverage;
     let [left, straight, right, recovery] =
         [left, 1.0 - left - right, right, recovery].map(|share| format!("{:.0} %", 100.0 * share));
-    println!("{minutes:.1} minutes, {laps:.1} laps; {left} left, {straight} straight, {right} right; {recovery} ways back");
+    println!(
+        "{minutes:.1} minutes, {laps:.1} laps; {left} left, {straight} straight, {right} right; {recovery} ways back"
+    );
     for advice in &summary.advice {
         println!("{advice}");
     }

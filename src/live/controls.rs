@@ -108,7 +108,8 @@ impl Cockpit {
     /// car brakes.
     pub fn step(&mut self, input: Option<Input>, speed_mph: f64, most_mph: f64, step_s: f64) -> Controls {
         let Some(input) = input else {
-            *self = Cockpit { controls: Controls { steering: self.controls.steering, throttle: -1.0 }, ..Self::default() };
+            *self =
+                Cockpit { controls: Controls { steering: self.controls.steering, throttle: -1.0 }, ..Self::default() };
             self.controls.steering = keys::wheel(self.controls.steering, 0.0);
             return self.controls;
         };

@@ -103,12 +103,14 @@ impl Coverage {
         let laps = self.way_m / lap_m;
         let full_lock = self.share(self.full_lock);
         if full_lock > MUCH_FULL_LOCK {
-            advice.push(format!("{} of the labels are at full lock: drive slower, or with a mouse.", percent(full_lock)));
+            advice
+                .push(format!("{} of the labels are at full lock: drive slower, or with a mouse.", percent(full_lock)));
         }
         let zeros = self.share(self.zero);
         if zeros > MANY_ZEROS {
             let zeros = percent(zeros);
-            advice.push(format!("{zeros} of the labels are exactly zero: a mouse or gamepad tells finer how to steer."));
+            advice
+                .push(format!("{zeros} of the labels are exactly zero: a mouse or gamepad tells finer how to steer."));
         }
         let (turns, rarer) = (self.left + self.right, self.left.min(self.right));
         if laps >= 0.5 && (rarer as f64) < RARE_SIDE * turns as f64 {

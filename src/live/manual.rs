@@ -154,7 +154,8 @@ struct Session<'a> {
 
 impl<'a> Session<'a> {
     fn new(track: &'a Track, options: &'a RecordOptions, live: &'a Live, samples: Sender<Sample>) -> Session<'a> {
-        let start = Start { reverse: options.reverse, offset_m: 0.0, heading_deg: 0.0, ..Start::draw(track, options.seed) };
+        let start =
+            Start { reverse: options.reverse, offset_m: 0.0, heading_deg: 0.0, ..Start::draw(track, options.seed) };
         Session {
             options,
             live,
@@ -217,7 +218,8 @@ impl<'a> Session<'a> {
     fn put(&mut self, turned: bool, notice: &str) {
         let simulation = &mut self.simulation;
         simulation.reverse ^= turned;
-        let start = Start { s_m: simulation.location.s_m, reverse: simulation.reverse, offset_m: 0.0, heading_deg: 0.0 };
+        let start =
+            Start { s_m: simulation.location.s_m, reverse: simulation.reverse, offset_m: 0.0, heading_deg: 0.0 };
         simulation.put(start, 0.0);
         // A pause in the names of the pictures, so that a reader sees that the road does not go on.
         simulation.steps += 2 * STEPS_PER_S;

@@ -17,6 +17,8 @@ mod hub;
 pub mod manual;
 pub mod messages;
 mod server;
+pub mod watch;
 
 pub use manual::{ManualDrive, ManualSummary};
 pub use server::{DEFAULT_PORT, Live};
+pub use watch::Watch;

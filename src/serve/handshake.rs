@@ -47,7 +47,9 @@ pub fn examine(head: &[u8], allowed_origins: &[String]) -> Verdict {
     let request = match Head::parse(head) {
         Ok(Some(request)) => request,
         Ok(None) => return Verdict::Incomplete,
-        Err(BadHead::TooLong) => return refuse("431 Request Header Fields Too Large", "the request is longer than 8 KiB"),
+        Err(BadHead::TooLong) => {
+            return refuse("431 Request Header Fields Too Large", "the request is longer than 8 KiB");
+        }
         Err(BadHead::NotHttp) if head.first() == Some(&0x16) => {
             return refuse("400 Bad Request", "this is TLS; connect with ws:// instead of wss://");
         }

@@ -7,7 +7,8 @@ use std::time::Instant;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::run::{Driver, Expert, INTERVENTION_M, Run, RunOptions, line_errors_m, run};
+use super::observer::DriveObserver;
+use super::run::{Driver, Expert, INTERVENTION_M, Run, RunOptions, line_errors_m, run, run_observed};
 use super::speed::Speed;
 use super::statistics::{PairedTest, wilson_interval};
 use super::track::Track;
@@ -123,6 +124,59 @@ where
 {
     check(options)?;
     let done = AtomicUsize::new(0);
+    let measured: Vec<Measured> = (0..options.runs as u64)
+        .into_par_iter()
+        .map(|k| {
+            let measured = measure(track, &new_driver, options, k, None)?;
+            let count = done.fetch_add(1, Ordering::Relaxed) + 1;
+            if !progress(count as f64 / options.runs as f64) {
+                return Err(Error::Interrupted);
+            }
+            Ok(measured)
+        })
+        .collect::<Result<_>>()?;
+    Ok(put_together(track, options, measured, rayon::current_num_threads()))
+}
+
+/// As [`drive`], to the same bits, but one run after the other, telling `observer` every frame.
+///
+/// # Errors
+/// As [`drive`], and the observer's own.
+pub fn drive_observed<F>(
+    track: &Track,
+    new_driver: F,
+    options: &DriveOptions,
+    observer: &mut dyn DriveObserver,
+) -> Result<DriveResult>
+where
+    F: Fn() -> Result<Box<dyn Driver>>,
+{
+    check(options)?;
+    let runs = 0..options.runs as u64;
+    let measured =
+        runs.map(|k| measure(track, &new_driver, options, k, Some(&mut *observer))).collect::<Result<_>>()?;
+    Ok(put_together(track, options, measured, 1))
+}
+
+/// What is measured of one seed.
+struct Measured {
+    pair: RunPair,
+    expert: Run,
+    simulated_s: f64,
+    busy_s: f64,
+}
+
+/// Drives the `k`-th seed free, assisted, and with the expert.
+fn measure<F>(
+    track: &Track,
+    new_driver: &F,
+    options: &DriveOptions,
+    k: u64,
+    mut observer: Option<&mut dyn DriveObserver>,
+) -> Result<Measured>
+where
+    F: Fn() -> Result<Box<dyn Driver>>,
+{
     let of_run = |assisted| RunOptions {
         laps: options.laps,
         speed: options.speed,
@@ -130,41 +184,43 @@ where
         noise: options.noise,
         assisted,
     };
-    let pairs: Vec<(RunPair, Run, [f64; 2])> = (0..options.runs as u64)
-        .into_par_iter()
-        .map(|k| {
-            let seed = options.seed.wrapping_add(k);
-            let began = Instant::now();
-            let free = run(track, new_driver()?.as_mut(), &of_run(false), seed)?;
-            let mut simulated_s = free.time_s;
-            // A run that nobody would have interrupted is the same with help as without.
-            let assisted = if free.failure.is_none() && free.worst_cte_m <= INTERVENTION_M {
-                free.clone()
-            } else {
-                let assisted = run(track, new_driver()?.as_mut(), &of_run(true), seed)?;
-                simulated_s += assisted.time_s;
-                assisted
-            };
-            let busy_s = began.elapsed().as_secs_f64();
-            let expert = run(track, &mut Expert, &of_run(false), seed)?;
-            let count = done.fetch_add(1, Ordering::Relaxed) + 1;
-            if !progress(count as f64 / options.runs as f64) {
-                return Err(Error::Interrupted);
-            }
-            Ok((RunPair { seed, free, assisted }, expert, [simulated_s, busy_s]))
-        })
-        .collect::<Result<_>>()?;
-    let [simulated_s, busy_s] = [0, 1].map(|k| pairs.iter().map(|p| p.2[k]).sum::<f64>());
-    let expert_sum: f64 = pairs.iter().map(|p| p.1.whiteness_sum).sum();
-    let expert_s: f64 = pairs.iter().map(|p| p.1.time_s).sum();
-    let runs: Vec<RunPair> = pairs.into_iter().map(|p| p.0).collect();
-    let realtime_factor = simulated_s / busy_s.max(1e-9) * rayon::current_num_threads().min(options.runs) as f64;
+    let seed = options.seed.wrapping_add(k);
+    let mut go = |assisted| {
+        let mut driver = new_driver()?;
+        match &mut observer {
+            Some(observer) => run_observed(track, driver.as_mut(), &of_run(assisted), seed, &mut **observer),
+            None => run(track, driver.as_mut(), &of_run(assisted), seed),
+        }
+    };
+    let began = Instant::now();
+    let free = go(false)?;
+    let mut simulated_s = free.time_s;
+    // A run that nobody would have interrupted is the same with help as without.
+    let assisted = if free.failure.is_none() && free.worst_cte_m <= INTERVENTION_M {
+        free.clone()
+    } else {
+        let assisted = go(true)?;
+        simulated_s += assisted.time_s;
+        assisted
+    };
+    let busy_s = began.elapsed().as_secs_f64();
+    let expert = run(track, &mut Expert, &of_run(false), seed)?;
+    Ok(Measured { pair: RunPair { seed, free, assisted }, expert, simulated_s, busy_s })
+}
+
+/// The result of all seeds, driven by `threads` threads.
+fn put_together(track: &Track, options: &DriveOptions, measured: Vec<Measured>, threads: usize) -> DriveResult {
+    let sum = |of: fn(&Measured) -> f64| measured.iter().map(of).sum::<f64>();
+    let (simulated_s, busy_s) = (sum(|m| m.simulated_s), sum(|m| m.busy_s));
+    let (expert_sum, expert_s) = (sum(|m| m.expert.whiteness_sum), sum(|m| m.expert.time_s));
+    let realtime_factor = simulated_s / busy_s.max(1e-9) * threads.min(options.runs) as f64;
+    let runs: Vec<RunPair> = measured.into_iter().map(|m| m.pair).collect();
     let summary = DriveSummary {
         expert_whiteness_deg_s: (expert_sum / expert_s.max(1e-9)).sqrt(),
         realtime_factor,
         ..summarise(track, options, &runs)
     };
-    Ok(DriveResult { runs, summary })
+    DriveResult { runs, summary }
 }
 
 fn check(options: &DriveOptions) -> Result<()> {
@@ -288,6 +344,7 @@ pub fn trajectory_csv(run: &Run) -> String {
 
 #[cfg(test)]
 mod tests {
+    use super::super::observer::DriveFrame;
     use super::super::run::Zero;
     use super::*;
 
@@ -321,6 +378,32 @@ mod tests {
             pool.install(|| go("mountain", true, 4).runs)
         };
         assert_eq!(with(1), with(3));
+    }
+
+    #[test]
+    fn a_drive_that_is_watched_has_the_same_runs() {
+        struct Watching(Vec<(u64, bool)>, usize);
+        impl DriveObserver for Watching {
+            fn begin(&mut self, seed: u64, options: &RunOptions) {
+                self.0.push((seed, options.assisted));
+            }
+
+            fn frame(&mut self, _: &DriveFrame) -> Result<()> {
+                self.1 += 1;
+                Ok(())
+            }
+        }
+        let track = Track::load("lake").unwrap();
+        let make = || -> Result<Box<dyn Driver>> { Ok(Box::new(Zero)) };
+        let options = DriveOptions { runs: 2, seed: 3, ..Default::default() };
+        let mut watching = Watching(Vec::new(), 0);
+        let watched = drive_observed(&track, make, &options, &mut watching).unwrap();
+        let unseen = drive(&track, make, &options, &|_| true).unwrap();
+        assert_eq!(watched.runs, unseen.runs);
+        let summary = DriveSummary { realtime_factor: unseen.summary.realtime_factor, ..watched.summary };
+        assert_eq!(summary, unseen.summary);
+        assert_eq!(watching.0, [(3, false), (3, true), (4, false), (4, true)]);
+        assert_eq!(watching.1, unseen.runs.iter().map(|r| r.free.moments.len() + r.assisted.moments.len()).sum());
     }
 
     #[test]

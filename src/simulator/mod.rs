@@ -39,7 +39,7 @@ pub mod writer;
 pub use camera::{BodyPose, Camera, HEIGHT, Mount, RgbFrame, WIDTH};
 pub use closed_loop::ClosedLoop;
 pub use contact_sheet::{contact_sheet, side_by_side};
-pub use drive::{DriveOptions, DriveResult, DriveSummary, compare, drive};
+pub use drive::{DriveOptions, DriveResult, DriveSummary, compare, drive, drive_observed};
 pub use light::Variant;
 pub use observer::{DriveFrame, DriveObserver};
 pub use recorder::{LogFormat, RecordOptions, record};

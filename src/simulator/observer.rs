@@ -43,6 +43,9 @@ impl DriveFrame<'_> {
 
 /// Sees every frame of a run as it is driven. It changes nothing of the run, except that it may end it.
 pub trait DriveObserver {
+    /// A run begins.
+    fn begin(&mut self, _seed: u64, _options: &RunOptions) {}
+
     /// Takes notice of a frame. An error ends the run and becomes its result; [`Interrupted`](crate::Error::Interrupted) is
     /// for whoever has seen enough.
     ///

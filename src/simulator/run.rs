@@ -198,6 +198,9 @@ fn drive_run(
     let mut eye = (driver.needs_frame() || observer.is_some()).then(|| Eye::new(track, seed));
     let blank = RgbFrame::default();
     let mut controller = SpeedController::default();
+    if let Some(observer) = &mut observer {
+        observer.begin(seed, options);
+    }
     while closed_loop.goes_on() {
         if closed_loop.frame_is_due() {
             let simulation = closed_loop.simulation();
