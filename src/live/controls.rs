@@ -7,8 +7,9 @@ use crate::simulator::car::Controls;
 use crate::simulator::keys;
 use crate::simulator::speed::SpeedController;
 
-/// Who says nothing for so long has let go. A page in the background speaks once a second at most, so it lets go, too.
-const SILENCE: Duration = Duration::from_millis(800);
+/// Who says nothing for so long has let go. (A page that is hidden says that it leaves; a browser that ends closes its
+/// connection. This is for one that hangs.)
+const SILENCE: Duration = Duration::from_millis(1500);
 
 /// What happens once, when a page asks for it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -75,7 +75,7 @@ impl DriveObserver for Watch<'_> {
         self.begun += usize::from(self.seed != Some(seed));
         (self.seed, self.clock, self.way) = (Some(seed), None, self.way + 1);
         let help = if options.assisted { "again, put back when 1 m off the middle" } else { "without help" };
-        self.title = format!("{}, run {} of {} (seed {seed}), {help}:", self.driver, self.begun, self.runs);
+        self.title = format!("{}, run {} of {} (seed {seed}), {help}", self.driver, self.begun, self.runs);
     }
 
     fn frame(&mut self, frame: &DriveFrame) -> Result<()> {

@@ -44,6 +44,11 @@ impl Served {
     pub fn start(folder: &Path, model: &str, args: &[&str]) -> Served {
         let mut command = steersman(folder);
         command.args(["serve", model, "--port", "0", "--json"]).args(args);
+        Served::spawn(command, "ws://")
+    }
+
+    /// Runs `command`, and waits until it says at which port it serves, in an address that begins with `scheme`.
+    pub fn spawn(mut command: Command, scheme: &str) -> Served {
         let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
         let stderr = BufReader::new(child.stderr.take().unwrap());
         let said = Arc::new((Mutex::new(String::new()), Condvar::new()));
@@ -59,8 +64,8 @@ impl Served {
             })
         };
         let mut served = Served { child, port: 0, said, listener: Some(listener) };
-        let text = served.wait_until_it_says("listening on ws://");
-        let address = text.split("listening on ws://").nth(1).unwrap().split('/').next().unwrap();
+        let text = served.wait_until_it_says(scheme);
+        let address = text.split(scheme).nth(1).unwrap().split('/').next().unwrap();
         served.port = address.rsplit(':').next().unwrap().parse().unwrap();
         served
     }
@@ -85,10 +90,25 @@ impl Served {
         line.split_whitespace().next()?.parse().ok()
     }
 
-    /// Presses Ctrl-C. What it printed as JSON, and all it said.
-    pub fn stop(mut self) -> (Value, String) {
+    /// Presses Ctrl-C.
+    pub fn interrupt(&self) {
         let killed = Command::new("kill").args(["-INT", &self.child.id().to_string()]).status().unwrap();
         assert!(killed.success());
+    }
+
+    /// Waits for the end; the exit code.
+    pub fn code(mut self) -> Option<i32> {
+        self.child.wait().unwrap().code()
+    }
+
+    /// Presses Ctrl-C. What it printed as JSON, and all it said.
+    pub fn stop(self) -> (Value, String) {
+        self.interrupt();
+        self.end()
+    }
+
+    /// Waits for the end. What it printed as JSON, and all it said.
+    pub fn end(mut self) -> (Value, String) {
         let mut printed = String::new();
         self.child.stdout.take().unwrap().read_to_string(&mut printed).unwrap();
         let status = self.child.wait().unwrap();

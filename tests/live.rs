@@ -1,0 +1,259 @@
+//! The live page without a browser: what it serves and to whom, driving by hand, watching.
+
+mod common;
+
+use std::fs;
+use std::net::TcpListener;
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use common::command::{error, json};
+use common::page::{Page, serve};
+use common::served::{Served, random_model};
+use serde_json::{Value, json};
+use steersman::dataset;
+use steersman::dataset::decode::{RgbImage, decode_rgb};
+
+/// Starts driving by hand in `folder`, recording into `rec`.
+fn by_hand(folder: &Path, args: &[&str]) -> Served {
+    serve(folder, &[&["record", "--manual", "--out", "rec", "--json"], args].concat())
+}
+
+/// Drives at full throttle, steering as told, until `rows` rows are recorded. On a busy machine the wheel may be lost for a
+/// moment, and recording pauses then.
+fn record_rows(page: &mut Page, steer: i32, rows: u64) -> Value {
+    let began = Instant::now();
+    loop {
+        page.press(steer, 1);
+        let manual = page.next().unwrap().state["manual"].clone();
+        if manual["rows"].as_u64().unwrap() >= rows {
+            return manual;
+        }
+        if manual["recording"] == false {
+            page.ask(&json!({ "type": "record" }));
+            page.next().unwrap();
+        }
+        assert!(began.elapsed() < common::double::SILENCE, "{manual}");
+    }
+}
+
+fn entries(folder: &Path) -> Vec<String> {
+    fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect()
+}
+
+#[test]
+fn keys_steer_the_car_and_what_was_driven_is_on_disk() {
+    let folder = tempfile::tempdir().unwrap();
+    let dir = folder.path();
+    let served = by_hand(dir, &["--track", "coast", "--hz", "25"]);
+    let mut page = Page::open(served.port);
+    assert_eq!(
+        (&page.hello["mode"], &page.hello["track"], &page.hello["held_out"]),
+        (&json!("manual"), &json!("coast"), &json!(true))
+    );
+    assert!(page.hello["edges"][0].as_array().unwrap().len() > 500);
+    let standing = page.next().unwrap();
+    assert_eq!(standing.number("speed_mph"), 0.0);
+    let mut picture = RgbImage::default();
+    decode_rgb(&standing.camera, &mut picture).unwrap();
+    assert!((picture.width, picture.height) == (320, 160) && standing.saliency.is_empty());
+
+    page.hold_until(0, 1, |frame| frame.number("speed_mph") > 5.0);
+    let manual = record_rows(&mut page, 0, 20);
+    assert_eq!(manual["driver"], page.hello["id"]);
+    // Full lock after 0.4 s; released, the wheel comes back to exactly 0.
+    page.hold_until(-1, 0, |frame| frame.number("steering") == -1.0);
+    page.hold_until(0, 0, |frame| frame.number("steering") == 0.0);
+    page.hold_until(1, 0, |frame| frame.number("steering") > 0.2);
+    let wheel = json!({ "type": "controls", "wheel": 0.125, "pedals": -1 });
+    page.ask(&wheel);
+    let began = Instant::now();
+    while page.next().unwrap().number("steering") != 0.125 {
+        page.ask(&wheel);
+        assert!(began.elapsed() < common::double::SILENCE);
+    }
+
+    page.ask(&json!({ "type": "finish" }));
+    let words = loop {
+        if let Err(words) = page.next() {
+            break words;
+        }
+    };
+    let (summary, _) = served.end();
+    let rows = summary["rows"].as_u64().unwrap();
+    assert!(rows >= 20 && words.contains(&format!("{rows} rows are in rec")), "{words} {summary}");
+    assert_eq!((&summary["style"], &summary["held_out"], &summary["hz"]), (&json!("manual"), &json!(true), &json!(25)));
+    assert_eq!(entries(dir), ["rec"]);
+    let side = fs::read_to_string(dir.join("rec/recording.toml")).unwrap();
+    assert!(side.contains("style = \"manual\"") && side.contains("held_out = true"), "{side}");
+    assert_eq!(entries(&dir.join("rec/IMG")).len() as u64, 3 * rows);
+    let report = &json(dir, &["inspect", "rec", "--json"])[0];
+    assert_eq!((report["usable"].as_u64(), report["rows"].as_u64()), (Some(rows), Some(rows)), "{report}");
+    let recording = dataset::load(&dir.join("rec")).unwrap();
+    assert!(recording.notices.is_empty(), "{:?}", recording.notices);
+    assert!(
+        recording.rows.iter().any(|row| row.steering < -0.9) && recording.rows.iter().any(|row| row.throttle > 0.9)
+    );
+    // Training must not see it.
+    assert!(error(dir, &["train", "rec", "--out", "run"]).contains("coast"));
+    assert!(error(dir, &["record", "--track", "lake", "--manual", "--out", "rec"]).contains("exists already"));
+}
+
+#[test]
+fn without_a_page_the_car_brakes_and_recording_pauses_and_ctrl_c_loses_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let served = by_hand(folder.path(), &["--track", "lake", "--format", "v2"]);
+    let (mut driver, mut guest) = (Page::open(served.port), Page::open(served.port));
+    driver.hold_until(0, 1, |frame| frame.number("speed_mph") > 12.0);
+    record_rows(&mut driver, 0, 8);
+    // Who looks on cannot press anything.
+    guest.ask(&json!({ "type": "record" }));
+    guest.ask(&json!({ "type": "finish" }));
+    drop(driver);
+    let began = Instant::now();
+    let stopped = loop {
+        let frame = guest.next().unwrap();
+        if frame.number("speed_mph") == 0.0 {
+            break frame;
+        }
+        assert!(began.elapsed() < common::double::SILENCE, "{}", frame.state);
+    };
+    let manual = &stopped.state["manual"];
+    assert_eq!((&manual["driver"], &manual["recording"]), (&Value::Null, &json!(false)), "{manual}");
+    assert!(manual["notice"].as_str().unwrap().contains("Nobody was at the wheel"), "{manual}");
+    assert!(!folder.path().join("rec").exists(), "the recording gets its name when it is whole");
+
+    // The guest takes the wheel, turns round, and drives on.
+    let at = stopped.number("laps");
+    guest.ask(&json!({ "type": "take" }));
+    guest.ask(&json!({ "type": "turn_round" }));
+    guest.hold_until(0, 1, |frame| frame.number("put_back") == 1.0 && frame.number("laps") > at + 0.001);
+    record_rows(&mut guest, 0, 20);
+    let (summary, _) = served.stop();
+    assert!(guest.next().is_err(), "the page is told that it is over");
+    let recording = dataset::load(&folder.path().join("rec")).unwrap();
+    assert_eq!(recording.rows.len() as u64, summary["rows"].as_u64().unwrap());
+    assert!(recording.sessions.len() >= 2, "the pause is seen: {:?}", recording.sessions);
+    assert!(summary["coverage"]["reverse"].as_f64().unwrap() > 0.1, "{summary}");
+}
+
+#[test]
+fn nothing_recorded_leaves_nothing_behind() {
+    let folder = tempfile::tempdir().unwrap();
+    let served = by_hand(folder.path(), &["--track", "lake"]);
+    Page::open(served.port).hold_until(0, 1, |frame| frame.number("speed_mph") > 1.0);
+    let (summary, _) = served.stop();
+    assert_eq!((&summary["rows"], &summary["folder"]), (&json!(0), &Value::Null));
+    assert!(entries(folder.path()).is_empty());
+}
+
+#[test]
+fn strangers_are_refused_and_drive_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let served = by_hand(folder.path(), &["--track", "lake"]);
+    let port = served.port;
+    let own = format!("127.0.0.1:{port}");
+    let ask = |request: &str, host: &str, more: &str| {
+        let answer = served.ask(&format!("{request} HTTP/1.1\r\nHost: {host}\r\n{more}\r\n"));
+        let status: u16 = answer.split(' ').nth(1).unwrap_or_else(|| panic!("{answer}")).parse().unwrap();
+        (status, answer)
+    };
+    let (status, page) = ask("GET /", &own, "");
+    assert!(
+        status == 200 && page.contains("Content-Security-Policy: default-src 'none'") && page.ends_with("</html>\n")
+    );
+    assert_eq!(ask("GET /", &format!("localhost:{port}"), "").0, 200);
+    // A name that was made to point here after its page was loaded.
+    assert_eq!(ask("GET /", &format!("evil.example:{port}"), "").0, 403);
+    assert_eq!(ask("GET /favicon.ico", &own, "").0, 404);
+    assert_eq!(ask("GET /../Cargo.toml", &own, "").0, 404);
+    assert_eq!(ask("POST /", &own, "Content-Length: 0\r\n").0, 405);
+    assert_eq!(ask("GET /live", &own, "").0, 426);
+    let upgrade = "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n\
+        Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n";
+    for origin in ["http://evil.example", "null", "http://127.0.0.1:1", "https://localhost"] {
+        assert_eq!(ask("GET /live", &own, &format!("{upgrade}Origin: {origin}\r\n")).0, 403, "{origin}");
+    }
+    assert_eq!(ask("GET /live", &format!("evil.example:{port}"), upgrade).0, 403);
+    assert!(served.ask("\u{16}\u{3}\u{1}\r\n\r\n").starts_with("HTTP/1.1 400"));
+    assert!(served.ask(&format!("GET / HTTP/1.1\r\nX: {}", "x".repeat(9000))).starts_with("HTTP/1.1 431"));
+
+    let mut page = Page::open(port);
+    for nonsense in [json!({ "type": "fly" }), json!("next"), json!({ "type": "controls", "wheel": "left" })] {
+        let mut bad = Page::open(port);
+        bad.ask(&nonsense);
+        assert!(std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| bad.next())).is_err(), "{nonsense}");
+    }
+    // Connections that say nothing take no place for long, and whoever drives drives on.
+    let idle: Vec<_> = (0..8).map(|_| served.connect_tcp()).collect();
+    page.hold_until(0, 1, |frame| frame.number("speed_mph") > 3.0);
+    drop(idle);
+    served.stop();
+}
+
+#[test]
+fn a_drive_is_watched_in_real_time_by_several_and_ends_with_ctrl_c() {
+    let folder = tempfile::tempdir().unwrap();
+    let dir = folder.path();
+    random_model(&dir.join("model.safetensors"), "lenet");
+    let served = serve(dir, &["drive", "model.safetensors", "--track", "lake", "--watch", "--runs", "2"]);
+    let mut page = Page::open(served.port);
+    assert_eq!(page.hello["mode"], "watch");
+    let (first, began) = (page.next().unwrap(), Instant::now());
+    let mut pictures = [RgbImage::default(), RgbImage::default()];
+    decode_rgb(&first.camera, &mut pictures[0]).unwrap();
+    decode_rgb(&first.saliency, &mut pictures[1]).unwrap();
+    assert!((pictures[1].width, pictures[1].height) == (320, 160) && pictures[0] != pictures[1]);
+
+    // A slow page skips frames, and slows nothing down.
+    let mut slow = Page::open(served.port);
+    slow.next().unwrap();
+    let mut frames = 1;
+    let last = loop {
+        let frame = page.next().unwrap();
+        frames += 1;
+        if frame.state["way"] != first.state["way"] || frame.number("time_s") > first.number("time_s") + 2.0 {
+            break frame;
+        }
+    };
+    let (driven_s, waited_s) = (last.number("time_s") - first.number("time_s"), began.elapsed().as_secs_f64());
+    assert!(frames > 5 && driven_s < waited_s + 0.4, "{frames} frames, {driven_s} s driven in {waited_s} s");
+    let skipped = slow.next().unwrap();
+    assert!(skipped.number("way") > last.number("way") || skipped.number("time_s") >= last.number("time_s") - 0.2);
+
+    // Commands of a watching page mean nothing.
+    page.ask(&json!({ "type": "finish" }));
+    page.press(1, 1);
+    // A random network leaves the road; then the same run is driven with help, on a clean map.
+    let began = Instant::now();
+    while page.next().unwrap().state["way"] == first.state["way"] {
+        assert!(began.elapsed() < common::double::SILENCE);
+    }
+    std::thread::sleep(Duration::from_secs(1));
+    let late = Page::open(served.port);
+    assert!(!late.hello["trail"].as_array().unwrap().is_empty(), "who comes late sees the way so far");
+    drop((late, slow));
+    served.interrupt();
+    let words = loop {
+        if let Err(words) = page.next() {
+            break words;
+        }
+    };
+    assert!(!words.is_empty());
+    assert_eq!(served.code(), Some(130));
+}
+
+#[test]
+fn a_port_that_is_taken_is_told_with_the_remedy_and_leaves_nothing_behind() {
+    let folder = tempfile::tempdir().unwrap();
+    let taken = TcpListener::bind("127.0.0.1:0").unwrap();
+    let port = taken.local_addr().unwrap().port().to_string();
+    let watch = ["drive", "expert", "--track", "lake", "--watch", "--port", &port];
+    let manual = ["record", "--track", "lake", "--manual", "--out", "rec", "--port", &port];
+    for args in [&watch[..], &manual[..]] {
+        let message = error(folder.path(), args);
+        assert!(message.contains(&port) && message.contains("another program has this port"), "{message}");
+        assert!(message.contains("--port; 0 takes any free one"), "{message}");
+    }
+    assert!(entries(folder.path()).is_empty());
+}

@@ -1,0 +1,131 @@
+//! The live page in a real browser, where there is one: `apt-get install chromium`, or another Chromium on the PATH.
+
+mod common;
+
+use common::browser::Browser;
+use common::command::json;
+use common::page::serve;
+use common::served::random_model;
+use serde_json::json;
+
+/// Fails if something does not fit into the window, or is cut off.
+fn assert_fits(browser: &mut Browser, size: [u32; 2]) {
+    browser.resize(size);
+    browser.wait_for(&format!("innerWidth === {} && innerHeight === {}", size[0], size[1]));
+    let beyond = browser.value(
+        "[...document.querySelectorAll('header, figure, canvas, button, p, li, #words, #shares, .gauge')]
+           .filter(e => e.offsetParent && (r => r.bottom > innerHeight + 1 || r.right > innerWidth + 1 || r.x < -1)
+             (e.getBoundingClientRect()) || e.id === 'words' && e.scrollHeight > e.clientHeight + 1
+             || e.className === 'gauge' && e.scrollWidth > e.clientWidth + 1)
+           .map(e => e.outerHTML.slice(0, 80))
+           .concat(document.documentElement.scrollHeight > innerHeight ? ['the page scrolls'] : [])",
+    );
+    assert_eq!(beyond, json!([]), "at {size:?}");
+}
+
+#[test]
+fn a_person_drives_with_keys_and_mouse_and_gamepad_and_the_recording_is_on_disk() {
+    let folder = tempfile::tempdir().unwrap();
+    let dir = folder.path();
+    let served = serve(dir, &["record", "--track", "lake", "--manual", "--out", "rec", "--json"]);
+    let Some(mut browser) = Browser::open(&format!("http://127.0.0.1:{}/", served.port), [1024, 768]) else { return };
+    browser.wait_for("document.getElementById('link')?.textContent === 'you drive'");
+    browser.wait_for("document.getElementById('angle').textContent === '0.0°'");
+    assert!(browser.colours("camera") > 500, "a picture of the road");
+    assert!(browser.colours("map") > 4 && browser.colours("chart") > 4 && browser.colours("wheel") > 4);
+    assert_fits(&mut browser, [1600, 900]);
+    assert_fits(&mut browser, [1024, 768]);
+
+    browser.key("KeyW", true);
+    browser.wait_for("parseFloat(document.getElementById('speed').textContent) > 5");
+    browser.key("KeyR", true);
+    browser.key("KeyR", false);
+    browser.wait_for("document.getElementById('state').textContent.includes('● recording')");
+    let before = browser.value("document.getElementById('camera').toDataURL()");
+    browser.key("ArrowLeft", true);
+    browser.wait_for("document.getElementById('angle').textContent === '−25.0°'");
+    browser.key("ArrowLeft", false);
+    browser.wait_for("document.getElementById('angle').textContent === '0.0°'");
+    browser.key("KeyW", false);
+    assert_ne!(browser.value("document.getElementById('camera').toDataURL()"), before, "the picture moves");
+
+    // A sixth of the window's width is full lock.
+    let [x, y] = browser.middle("camera");
+    browser.mouse("mousePressed", x, y);
+    browser.mouse("mouseMoved", x + 1024.0 / 12.0, y);
+    browser.wait_for("Math.abs(parseFloat(document.getElementById('angle').textContent) - 12.5) < 0.6");
+    browser.mouse("mouseReleased", x + 1024.0 / 12.0, y);
+    browser.wait_for("document.getElementById('angle').textContent === '0.0°'");
+
+    browser.value(
+        "navigator.getGamepads = () => [{ connected: true, axes: [-0.54, 0],
+           buttons: Array.from({ length: 17 }, (_, k) => ({ value: k === 6 ? 1 : 0, pressed: k === 6 })) }]; true",
+    );
+    browser.wait_for("document.getElementById('angle').textContent === '−12.5°'");
+    browser.wait_for("document.getElementById('throttle').textContent === 'brake 100 %'");
+    browser.value("navigator.getGamepads = () => []; true");
+
+    browser.wait_for("state.manual.rows > 5");
+    assert_fits(&mut browser, [1024, 768]);
+    let [x, y] = browser.middle("finish");
+    browser.mouse("mousePressed", x, y);
+    browser.mouse("mouseReleased", x, y);
+    browser.wait_for("!document.getElementById('over').hidden");
+    let words = browser.value("document.getElementById('over').textContent");
+    let (summary, _) = served.end();
+    let rows = summary["rows"].as_u64().unwrap();
+    assert!(words.as_str().unwrap().contains(&format!("{rows} rows are in rec")), "{words} {summary}");
+    assert_eq!(json(dir, &["inspect", "rec", "--json"])[0]["usable"], rows);
+    let log = std::fs::read_to_string(dir.join("rec/driving_log.csv")).unwrap();
+    assert!(log.lines().any(|line| line.contains(", -1, ")), "full lock to the left was driven: {log}");
+    assert!(browser.complaints.is_empty(), "{:?}", browser.complaints);
+}
+
+#[test]
+fn a_hidden_page_lets_go_of_the_wheel() {
+    let folder = tempfile::tempdir().unwrap();
+    let served = serve(folder.path(), &["record", "--track", "lake", "--manual", "--out", "rec", "--json"]);
+    let Some(mut browser) = Browser::open(&format!("http://127.0.0.1:{}/", served.port), [1024, 768]) else { return };
+    browser.wait_for("document.getElementById('link')?.textContent === 'you drive'");
+    browser.key("KeyW", true);
+    browser.wait_for("parseFloat(document.getElementById('speed').textContent) > 5");
+    browser.value(
+        "Object.defineProperty(document, 'hidden', { configurable: true, get: () => true });
+         document.dispatchEvent(new Event('visibilitychange')); true",
+    );
+    let mut guest = common::page::Page::open(served.port);
+    let began = std::time::Instant::now();
+    let stopped = loop {
+        let frame = guest.next().unwrap();
+        if frame.number("speed_mph") == 0.0 {
+            break frame;
+        }
+        assert!(began.elapsed() < common::double::SILENCE, "{}", frame.state);
+    };
+    assert!(stopped.state["manual"]["driver"].is_null(), "{}", stopped.state);
+    browser.value("delete document.hidden; document.dispatchEvent(new Event('visibilitychange')); true");
+    browser.wait_for("document.getElementById('link').textContent === 'you drive'");
+    served.stop();
+}
+
+#[test]
+fn a_drive_is_watched_with_its_saliency() {
+    let folder = tempfile::tempdir().unwrap();
+    random_model(&folder.path().join("model.safetensors"), "default");
+    let served = serve(folder.path(), &["drive", "model.safetensors", "--track", "mountain", "--watch"]);
+    let Some(mut browser) = Browser::open(&format!("http://127.0.0.1:{}/", served.port), [1024, 768]) else { return };
+    browser.wait_for("document.body.classList.contains('two')");
+    assert!(browser.colours("camera") > 500 && browser.colours("saliency") > 500);
+    let same = "document.getElementById('camera').toDataURL() === document.getElementById('saliency').toDataURL()";
+    assert_eq!(browser.value(same), false);
+    for size in [[1600, 900], [1024, 768]] {
+        assert_fits(&mut browser, size);
+    }
+    let time = browser.value("state.time_s + 100 * state.way").as_f64().unwrap();
+    browser.wait_for(&format!("state.time_s + 100 * state.way > {time} + 0.5"));
+    assert!(browser.complaints.is_empty(), "{:?}", browser.complaints);
+    // The browser stays; the page says that the drive is over.
+    served.interrupt();
+    browser.wait_for("!document.getElementById('over').hidden");
+    assert_eq!(served.code(), Some(130));
+}
