@@ -138,6 +138,30 @@ fn without_a_page_the_car_brakes_and_recording_pauses_and_ctrl_c_loses_nothing()
 }
 
 #[test]
+fn a_disk_that_fails_ends_the_drive_and_what_was_recorded_is_kept() {
+    let folder = tempfile::tempdir().unwrap();
+    let served = by_hand(folder.path(), &["--track", "lake"]);
+    let mut page = Page::open(served.port);
+    record_rows(&mut page, 0, 5);
+    let hidden = folder.path().join(&entries(folder.path())[0]);
+    assert!(hidden.file_name().unwrap().to_str().unwrap().starts_with(".rec-unfinished-"));
+    fs::rename(hidden.join("IMG"), hidden.join("elsewhere")).unwrap();
+    let words = loop {
+        page.press(0, 1);
+        if let Err(words) = page.next() {
+            break words;
+        }
+    };
+    assert!(words.contains("rec/IMG/") && words.contains("rows are in rec"), "{words}");
+    let said = served.wait_until_it_says("error:");
+    assert!(said.contains("rec/IMG/") && !said.contains("unfinished"), "{said}");
+    assert_eq!(served.code(), Some(1));
+    let log = fs::read_to_string(folder.path().join("rec/driving_log.csv")).unwrap();
+    assert!(log.lines().count() >= 6 && log.ends_with('\n'), "{log}");
+    assert!(folder.path().join("rec/recording.toml").is_file());
+}
+
+#[test]
 fn nothing_recorded_leaves_nothing_behind() {
     let folder = tempfile::tempdir().unwrap();
     let served = by_hand(folder.path(), &["--track", "lake"]);

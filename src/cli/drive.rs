@@ -93,7 +93,8 @@ pub fn run(args: DriveArgs) -> Result<()> {
     let against = args.against.as_deref().map(Wheel::find).transpose()?;
     // What cannot be created is told before minutes are spent.
     let folder = args.out.as_deref().map(NewFolder::create).transpose()?;
-    let hello = || Hello::new("watch", format!("at the wheel: {}", args.model), &track);
+    let then = args.against.as_ref().map_or(String::new(), |name| format!(", then {name}"));
+    let hello = || Hello::new("watch", format!("at the wheel: {}{then}", args.model), &track);
     let live = args.watch.then(|| Live::start(args.port, hello(), false)).transpose()?;
     let stop = stop_on_ctrl_c()?;
     if let Some(live) = &live {

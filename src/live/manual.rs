@@ -95,7 +95,7 @@ impl<'a> ManualDrive<'a> {
             let fault = "the recording ended early by a fault of this program".to_string();
             (session.coverage.shares(options.hz, track.length_m).rows, Some(Error::Usage(fault)))
         });
-        let trouble = drive.err().or(trouble).map(|error| folder.explain(error));
+        let trouble = drive.err().or(trouble);
         let advice = session.coverage.advice(track.length_m);
         let coverage = session.coverage.shares(options.hz, track.length_m);
         drop(session);
@@ -105,16 +105,24 @@ impl<'a> ManualDrive<'a> {
             ..RecordingInfo::new(track, options, rows)
         };
         let trouble = match info.write(folder.unfinished()) {
-            Err(error) if rows > 0 => trouble.or(Some(folder.explain(error))),
+            Err(error) if rows > 0 => trouble.or(Some(error)),
             _ => trouble,
         };
+        // The place that was meant; the hidden one is no more when the message is read.
+        let hidden = folder.unfinished().to_path_buf();
+        let trouble = trouble.map(|error| match error {
+            Error::Io { path, source } => {
+                Error::Io { path: path.strip_prefix(&hidden).map_or(path.clone(), |inside| out.join(inside)), source }
+            }
+            other => other,
+        });
         let folder = (rows > 0).then(|| folder.finish_anyhow());
         let words = match &folder {
             Some(folder) => format!("{rows} rows are in {}", folder.display()),
             None => format!("nothing was recorded, so there is no {}", out.display()),
         };
         if let Some(trouble) = trouble {
-            let message = format!("{trouble}; {words}");
+            let message = format!("{trouble}; {words}; look after the disk before you go on with a new folder");
             live.finish(&format!("The drive ended early: {message}."));
             return Err(Error::Usage(message));
         }

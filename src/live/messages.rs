@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::coverage::Shares;
 use crate::report::map;
+use crate::report::palette::heat_hex;
 use crate::simulator::car::MAX_STEER_DEG;
 use crate::simulator::expert::pursuit;
 use crate::simulator::speed::telemetry_mph;
@@ -88,7 +89,7 @@ impl Hello {
             lap_m: track.length_m,
             edges: map::edges(track),
             full_lock_deg: MAX_STEER_DEG,
-            heat: (0..map::COLOURS).map(map::colour_hex).collect(),
+            heat: (0..map::COLOURS).map(|step| heat_hex(map::step_share(step))).collect(),
             darkest_m: map::DARKEST_M,
         }
     }

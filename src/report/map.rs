@@ -58,6 +58,11 @@ pub fn draw(title: &str, track: Option<&Track>, drives: &[Vec<Place>], size: [f6
     svg.finish()
 }
 
+/// The place in [`heat`](super::palette::heat) of a step of colour; the lightest would not show on the road.
+pub(crate) fn step_share(step: usize) -> f64 {
+    0.25 + 0.75 * step as f64 / (COLOURS - 1) as f64
+}
+
 /// Right and left edge of the road, closed.
 pub(crate) fn edges(track: &Track) -> Vec<Vec<[f64; 2]>> {
     let around = || track.stations.iter().chain(track.stations.first());
@@ -70,11 +75,6 @@ pub(crate) fn edges(track: &Track) -> Vec<Vec<[f64; 2]>> {
     vec![edge(1.0).collect(), edge(-1.0).collect()]
 }
 
-/// The colour of step `i` of [`COLOURS`], as `#rrggbb`.
-pub(crate) fn colour_hex(i: usize) -> String {
-    heat_hex(0.25 + 0.75 * i as f64 / (COLOURS - 1) as f64)
-}
-
 /// Draws a way in stretches of one colour.
 fn way(svg: &mut Svg, drive: &[Place], place: &impl Fn([f64; 2]) -> [f64; 2]) {
     let colour = |p: &Place| ((p.cte_m.abs() / DARKEST_M * COLOURS as f64) as usize).min(COLOURS - 1);
@@ -85,7 +85,8 @@ fn way(svg: &mut Svg, drive: &[Place], place: &impl Fn([f64; 2]) -> [f64; 2]) {
             // The first point of the next stretch joins them, unless the car was lifted there.
             let joined = usize::from(i < drive.len() && !drive[i].put_back);
             let points: Vec<_> = drive[from..i + joined].iter().map(|p| place([p.x, p.y])).collect();
-            svg.polyline(&points, &format!("stroke=\"{}\" stroke-width=\"2.6\"", colour_hex(colour(&drive[from]))));
+            let share = step_share(colour(&drive[from]));
+            svg.polyline(&points, &format!("stroke=\"{}\" stroke-width=\"2.6\"", heat_hex(share)));
             from = i;
         }
     }
@@ -103,7 +104,8 @@ fn way(svg: &mut Svg, drive: &[Place], place: &impl Fn([f64; 2]) -> [f64; 2]) {
 fn legend(svg: &mut Svg, [_, height]: [f64; 2], scale: f64) {
     let y = height - 26.0;
     for i in 0..COLOURS {
-        svg.rect([16.0 + 18.0 * i as f64, y - 10.0], [18.0, 10.0], &format!("fill=\"{}\"", colour_hex(i)));
+        let share = step_share(i);
+        svg.rect([16.0 + 18.0 * i as f64, y - 10.0], [18.0, 10.0], &format!("fill=\"{}\"", heat_hex(share)));
     }
     let quiet = format!("fill=\"{QUIET_INK}\"");
     svg.text([16.0, y + 14.0], 12.0, Anchor::Start, &quiet, &format!("0 to {DARKEST_M:.0} m and more from the line"));
