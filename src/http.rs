@@ -12,9 +12,9 @@ use tungstenite::handshake::derive_accept_key;
 use crate::error::{Error, Result};
 
 /// Longest request, bytes.
-const MAX_HEAD: usize = 8 * 1024;
+pub(crate) const MAX_HEAD: usize = 8 * 1024;
 /// Most headers of a request.
-const MAX_HEADERS: usize = 64;
+pub(crate) const MAX_HEADERS: usize = 64;
 
 /// A request without a body.
 #[derive(Clone, Debug)]

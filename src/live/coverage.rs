@@ -153,8 +153,8 @@ mod tests {
         let steering = [-0.3, -0.05, 0.0, 0.04, 1.0];
         let coverage = driven(500, |k| Row {
             steering: steering[k % 5],
-            cte_m: if k % 10 == 0 { 1.0 } else { 0.2 },
-            heading_error: if k % 20 == 0 { -0.1 } else { 0.1 },
+            cte_m: if k.is_multiple_of(10) { 1.0 } else { 0.2 },
+            heading_error: if k.is_multiple_of(20) { -0.1 } else { 0.1 },
             reverse: k < 100,
             way_m: 2.0,
         });
@@ -171,7 +171,7 @@ mod tests {
         assert!(Coverage::default().advice(500.0)[0].contains("Press R"));
         let left = |reverse| {
             move |k: usize| Row {
-                steering: if k % 3 == 0 { 0.01 } else { -0.2 },
+                steering: if k.is_multiple_of(3) { 0.01 } else { -0.2 },
                 reverse,
                 way_m: 0.9,
                 ..Row::default()
@@ -183,8 +183,8 @@ mod tests {
         let all = driven(6000, |k| Row {
             steering: [-0.2, 0.01, 0.2][k % 3],
             cte_m: 0.8,
-            heading_error: if k % 9 == 0 { -0.1 } else { 0.1 },
-            reverse: k % 2 == 0,
+            heading_error: if k.is_multiple_of(9) { -0.1 } else { 0.1 },
+            reverse: k.is_multiple_of(2),
             way_m: 0.9,
         });
         assert!(all.advice(800.0)[0].starts_with("Enough of everything"), "{:?}", all.advice(800.0));

@@ -147,7 +147,7 @@ mod tests {
         for end in 0..SIMULATOR.len() {
             assert_eq!(examine(&SIMULATOR.as_bytes()[..end], &[]), Verdict::Incomplete, "{end}");
         }
-        let endless = format!("GET / HTTP/1.1\r\nX: {}", "x".repeat(MAX_HEAD));
+        let endless = format!("GET / HTTP/1.1\r\nX: {}", "x".repeat(http::MAX_HEAD));
         assert_eq!(refusal(&endless).0, "431");
     }
 

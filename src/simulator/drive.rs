@@ -403,7 +403,10 @@ mod tests {
         let summary = DriveSummary { realtime_factor: unseen.summary.realtime_factor, ..watched.summary };
         assert_eq!(summary, unseen.summary);
         assert_eq!(watching.0, [(3, false), (3, true), (4, false), (4, true)]);
-        assert_eq!(watching.1, unseen.runs.iter().map(|r| r.free.moments.len() + r.assisted.moments.len()).sum());
+        assert_eq!(
+            watching.1,
+            unseen.runs.iter().map(|r| r.free.moments.len() + r.assisted.moments.len()).sum::<usize>()
+        );
     }
 
     #[test]
