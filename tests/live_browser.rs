@@ -114,7 +114,7 @@ fn a_drive_is_watched_with_its_saliency() {
     random_model(&folder.path().join("model.safetensors"), "default");
     let served = serve(folder.path(), &["drive", "model.safetensors", "--track", "mountain", "--watch"]);
     let Some(mut browser) = Browser::open(&format!("http://127.0.0.1:{}/", served.port), [1024, 768]) else { return };
-    browser.wait_for("document.body.classList.contains('two') && document.getElementById('title').textContent !== ''");
+    browser.wait_for("document.body?.classList.contains('two') && document.getElementById('title').textContent !== ''");
     assert!(browser.colours("camera") > 500 && browser.colours("saliency") > 500);
     let same = "document.getElementById('camera').toDataURL() === document.getElementById('saliency').toDataURL()";
     assert_eq!(browser.value(same), false);

@@ -64,11 +64,13 @@ pub struct Shares {
 impl Coverage {
     /// Counts a row.
     pub fn add(&mut self, row: &Row) {
+        // As the log says it, and as `inspect` will count it.
+        let steering = row.steering as f32;
         self.rows += 1;
-        self.left += usize::from(row.steering < -f64::from(STRAIGHT));
-        self.right += usize::from(row.steering > f64::from(STRAIGHT));
-        self.zero += usize::from(row.steering == 0.0);
-        self.full_lock += usize::from(row.steering.abs() >= f64::from(FULL_LOCK));
+        self.left += usize::from(steering < -STRAIGHT);
+        self.right += usize::from(steering > STRAIGHT);
+        self.zero += usize::from(steering == 0.0);
+        self.full_lock += usize::from(steering.abs() >= FULL_LOCK);
         // Positive errors are to the right, and so are positive angles: opposite signs lead back.
         self.recovery += usize::from(row.cte_m.abs() >= RECOVERY_M && row.cte_m * row.heading_error < 0.0);
         let way_m = row.way_m.max(0.0);

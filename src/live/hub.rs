@@ -94,7 +94,8 @@ impl Hub {
             newest.traces.clear();
             (newest.way, newest.traced_s) = (state.way, f64::NEG_INFINITY);
         }
-        if state.time_s - newest.traced_s >= TRACE_S {
+        // Times are multiples of a step, but for rounding.
+        if state.time_s - newest.traced_s > TRACE_S - 1e-6 {
             if newest.traces.len() >= MOST_TRACES {
                 let mut keep = false;
                 newest.traces.retain(|_| {
