@@ -2,6 +2,8 @@
 
 mod common;
 
+use std::time::{Duration, Instant};
+
 use common::browser::Browser;
 use common::command::json;
 use common::page::serve;
@@ -66,12 +68,14 @@ fn a_person_drives_with_keys_and_mouse_and_gamepad_and_the_recording_is_on_disk(
     browser.value("navigator.getGamepads = () => []; true");
 
     // On a busy machine the wheel may have been lost for a moment, and recording paused.
+    let began = Instant::now();
     while browser.value("state.manual.rows > 5") != true {
+        assert!(began.elapsed() < common::double::SILENCE, "no rows");
         if browser.value("state.manual.recording") == false {
             browser.key("KeyR", true);
             browser.key("KeyR", false);
         }
-        std::thread::sleep(std::time::Duration::from_millis(500));
+        std::thread::sleep(Duration::from_millis(500));
     }
     assert_fits(&mut browser, [1024, 768]);
     let [x, y] = browser.middle("finish");
@@ -101,7 +105,7 @@ fn a_hidden_page_lets_go_of_the_wheel() {
          document.dispatchEvent(new Event('visibilitychange')); true",
     );
     let mut guest = common::page::Page::open(served.port);
-    let began = std::time::Instant::now();
+    let began = Instant::now();
     let stopped = loop {
         let frame = guest.next().unwrap();
         if frame.number("speed_mph") == 0.0 {
