@@ -13,9 +13,11 @@ use rayon::prelude::*;
 use steersman_kernels::{Isa, update};
 
 use super::stages::{Kind, Stage, stages};
+use super::step_profile::{StageTime, StepTimes};
 use super::{Network, Parameters};
 use crate::layers::{BatchStatistics, Grads, Pair, Pass};
 use crate::loss::Loss;
+use crate::stopwatch::Stopwatch;
 
 /// Most shards a batch is cut into: enough to keep 16 threads busy.
 pub const MAX_SHARDS: usize = 16;
@@ -62,6 +64,7 @@ pub struct TrainingPlan {
     first_learning: usize,
     capacity: usize,
     isa: Isa,
+    times: StepTimes,
 }
 
 #[derive(Debug, Default)]
@@ -140,6 +143,7 @@ impl TrainingPlan {
             gradient: vec![0.0; network.count(true)],
             chunk_squares: vec![0.0; network.count(true).div_ceil(CHUNK)],
             first_learning: stages.iter().position(|stage| stage.learns(network)).unwrap_or(stages.len()),
+            times: StepTimes::off(stages.len()),
             stages,
             moments: vec![0.0; moments_end],
             moments_of,
@@ -163,6 +167,16 @@ impl TrainingPlan {
     /// L2 norm of the gradient, as it was after the last step.
     pub fn gradient_norm(&self) -> f64 {
         self.chunk_squares.iter().sum::<f64>().sqrt()
+    }
+
+    /// Measures from now on how long each stage takes; `reduce` gets the time for adding the shards' gradients up.
+    pub fn measure(&mut self, reduce: Stopwatch) {
+        self.times = StepTimes::on(self.stages.len(), reduce);
+    }
+
+    /// What [`measure`](TrainingPlan::measure) has found so far, in the order of the layers.
+    pub fn stage_times(&self, network: &Network) -> Vec<StageTime> {
+        StageTime::of(network, &self.stages, &self.times, self.first_learning)
     }
 
     /// Computes the mean loss of the batch and leaves its gradient in [`gradient`](TrainingPlan::gradient). Of the
@@ -214,8 +228,9 @@ impl TrainingPlan {
         input: StepInput,
         used: usize,
     ) {
-        let TrainingPlan { shards, stages, moments, moments_of, first_learning, .. } = self;
-        let run = Run { network, parameters, stages, moments, moments_of, first_learning: *first_learning, input };
+        let TrainingPlan { shards, stages, moments, moments_of, first_learning, times, .. } = self;
+        let first_learning = *first_learning;
+        let run = Run { network, parameters, stages, moments, moments_of, first_learning, input, times };
         shards[..used].par_iter_mut().for_each(|shard| {
             shard.reset();
             let group = shard.group_capacity(network);
@@ -236,7 +251,7 @@ impl TrainingPlan {
         input: StepInput,
         used: usize,
     ) {
-        let TrainingPlan { shards, stages, moments, moments_of, sums, segments, first_learning, .. } = self;
+        let TrainingPlan { shards, stages, moments, moments_of, sums, segments, first_learning, times, .. } = self;
         let first_learning = *first_learning;
         let shards = &mut shards[..used];
         let images = shards.last().map_or(0, |shard| shard.images.end);
@@ -246,7 +261,7 @@ impl TrainingPlan {
         let last = segments.len() - 1;
 
         for (index, segment) in segments.iter().enumerate() {
-            let run = Run { network, parameters, stages, moments, moments_of, first_learning, input };
+            let run = Run { network, parameters, stages, moments, moments_of, first_learning, input, times };
             let next_barrier = segments.get(index + 1).map(|next| next.start);
             shards.par_iter_mut().for_each(|shard| {
                 if index == 0 {
@@ -271,7 +286,7 @@ impl TrainingPlan {
             }
         }
         for (index, segment) in segments.iter().enumerate().rev() {
-            let run = Run { network, parameters, stages, moments, moments_of, first_learning, input };
+            let run = Run { network, parameters, stages, moments, moments_of, first_learning, input, times };
             // The stage at the start of a segment waits for the sums over all shards.
             let rest = if index > 0 { segment.start + 1..segment.end } else { segment.clone() };
             shards.par_iter_mut().for_each(|shard| {
@@ -296,22 +311,24 @@ impl TrainingPlan {
 
     /// Adds the shards' gradients up, in their order. Those of frozen layers count as 0.
     fn reduce_gradient(&mut self, network: &Network, used: usize) {
-        let TrainingPlan { shards, gradient, chunk_squares, isa, .. } = self;
+        let TrainingPlan { shards, gradient, chunk_squares, isa, times, .. } = self;
         let shards = &shards[..used];
         gradient.par_chunks_mut(CHUNK).zip(chunk_squares.par_iter_mut()).enumerate().for_each(
             |(index, (chunk, squares))| {
-                let range = index * CHUNK..index * CHUNK + chunk.len();
-                chunk.copy_from_slice(&shards[0].gradient[range.clone()]);
-                for shard in &shards[1..] {
-                    update::sum_into(*isa, chunk, &shard.gradient[range.clone()]);
-                }
-                for layer in network.layers().iter().filter(|layer| layer.frozen) {
-                    let (from, to) = (layer.params.start.max(range.start), layer.params.end.min(range.end));
-                    if from < to {
-                        chunk[from - range.start..to - range.start].fill(0.0);
+                times.reduce.time(|| {
+                    let range = index * CHUNK..index * CHUNK + chunk.len();
+                    chunk.copy_from_slice(&shards[0].gradient[range.clone()]);
+                    for shard in &shards[1..] {
+                        update::sum_into(*isa, chunk, &shard.gradient[range.clone()]);
                     }
-                }
-                *squares = update::sum_of_squares(*isa, chunk);
+                    for layer in network.layers().iter().filter(|layer| layer.frozen) {
+                        let (from, to) = (layer.params.start.max(range.start), layer.params.end.min(range.end));
+                        if from < to {
+                            chunk[from - range.start..to - range.start].fill(0.0);
+                        }
+                    }
+                    *squares = update::sum_of_squares(*isa, chunk);
+                })
             },
         );
     }
@@ -370,6 +387,7 @@ struct Run<'a> {
     moments_of: &'a [Range<usize>],
     first_learning: usize,
     input: StepInput<'a>,
+    times: &'a StepTimes,
 }
 
 impl<'a> Run<'a> {
@@ -403,7 +421,7 @@ impl<'a> Run<'a> {
             let n = images.len();
             let y = &mut from_here[0][..n * stage.output_len(self.network)];
             let (params, pass) = (self.params(index), self.pass(index, images.start));
-            match &stage.kind {
+            self.times.stages[index][0].time(|| match &stage.kind {
                 Kind::Layer => {
                     let layer = &self.network.layers()[stage.layers.start].layer;
                     layer.forward(params, &pass, n, x, y, &mut shard.scratch);
@@ -413,7 +431,7 @@ impl<'a> Run<'a> {
                     let places = &mut shard.places[index][..y.len()];
                     fused.forward(params, n, x, y, places, &mut shard.scratch);
                 }
-            }
+            });
         }
     }
 
@@ -440,7 +458,7 @@ impl<'a> Run<'a> {
             let replaces = stage.source.filter(|_| replaces_input(self.network, self.stages, index));
             // Nobody asks for the gradient of the images themselves, or of what comes before all that learns.
             let wanted = stage.source.filter(|source| *source >= self.first_learning);
-            match &stage.kind {
+            self.times.stages[index][1].time(|| match &stage.kind {
                 Kind::NormRectify(fused) => {
                     let source = replaces.expect("batch norm runs fused only after another stage");
                     let (in_place, d_output) = (shard.in_place, std::mem::take(&mut shard.d_output));
@@ -472,7 +490,7 @@ impl<'a> Run<'a> {
                         linear.backward_input(params, n, dy, &mut before[source][..x_len], &mut shard.scratch);
                     }
                 }
-            }
+            });
             shard.in_place = replaces.is_some();
             if !shard.in_place {
                 std::mem::swap(&mut shard.d_output, &mut shard.d_input);
@@ -482,7 +500,8 @@ impl<'a> Run<'a> {
 
     fn forward_sums(&self, stage: usize, barrier: &dyn BatchStatistics, shard: &mut Shard) {
         let x = self.stage_input(stage, &shard.activations, shard.images.clone());
-        barrier.forward_sums(shard.images.len(), x, &mut shard.sums[..barrier.sums_len()]);
+        let sums = &mut shard.sums[..barrier.sums_len()];
+        self.times.stages[stage][0].time(|| barrier.forward_sums(shard.images.len(), x, sums));
     }
 
     fn backward_sums(&self, index: usize, barrier: &dyn BatchStatistics, shard: &mut Shard) {
@@ -494,9 +513,9 @@ impl<'a> Run<'a> {
         let sums = &mut shard.sums[..barrier.sums_len()];
         let moments = self.pass(index, shard.images.start).moments;
         let dparams = &mut shard.gradient[stage.params(self.network)];
-        match &stage.kind {
+        self.times.stages[index][1].time(|| match &stage.kind {
             Kind::Layer | Kind::PooledConv(_) => barrier.backward_sums(moments, n, x, dy, sums, dparams),
             Kind::NormRectify(fused) => fused.backward_sums(self.params(index), moments, x, dy, sums, dparams),
-        }
+        });
     }
 }
