@@ -1,6 +1,6 @@
 //! Maximum and average pooling over windows that lie fully inside the image (no padding, sizes rounded down).
 
-use crate::simd::{Simd, get, put};
+use crate::simd::{Simd, get, get_first, put};
 
 /// The sizes of a pooling layer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -52,12 +52,11 @@ per_isa! {
         for (x, y) in x.chunks_exact(h * w).zip(y.chunks_exact_mut(out_h * out_w)).take(n * c) {
             for (oy, y) in y.chunks_exact_mut(out_w).enumerate() {
                 y.fill(f32::NEG_INFINITY);
-                for row in x[oy * stride_h * w..].chunks_exact(w).take(kh) {
-                    match (kw, stride_w) {
-                        (2, 2) => max_of_blocks::<2>(y, row),
-                        (4, 4) => max_of_blocks::<4>(y, row),
-                        _ => max_of_windows(y, row, kw, stride_w),
-                    }
+                let rows = &x[oy * stride_h * w..][..kh * w];
+                match (kw, stride_w) {
+                    (2, 2) => max_of_blocks::<2>(y, rows, w),
+                    (4, 4) => max_of_blocks::<4>(y, rows, w),
+                    _ => rows.chunks_exact(w).for_each(|row| max_of_windows(y, row, kw, stride_w)),
                 }
             }
         }
@@ -99,7 +98,7 @@ per_isa! {
     }
 }
 
-/// Columns at a time, in [`max_forward_with_places`].
+/// Columns at a time.
 const STRIP: usize = 64;
 
 /// A row of at most `STRIP / 4` windows of 4 columns and `kh` rows, the first of which begins at `rows[0]`, the place
@@ -129,13 +128,17 @@ fn max_of_strip<S: Simd>(
         put(simd, &mut most, at, best);
         put(simd, &mut row_of, at, best_row);
     }
-    for at in whole..columns {
-        for ky in 0..kh {
-            let x = rows[ky * w + at];
-            if x > most[at] {
-                (most[at], row_of[at]) = (x, ky as f32);
-            }
+    if whole < columns {
+        // What the lanes after the last column hold is not looked at.
+        let rest = columns - whole;
+        let (mut best, mut best_row) = (get_first(simd, rows, whole, rest), simd.splat(0.0));
+        for ky in 1..kh {
+            let x = get_first(simd, rows, ky * w + whole, rest);
+            best_row = simd.select_greater(x, best, simd.splat(ky as f32), best_row);
+            best = simd.select_greater(x, best, x, best);
         }
+        put(simd, &mut most, whole, best);
+        put(simd, &mut row_of, whole, best_row);
     }
     // Then across the four columns of each window; of equal values the one in the upper row, then the left one.
     let windows = most.as_chunks::<4>().0.iter().zip(row_of.as_chunks::<4>().0);
@@ -151,15 +154,22 @@ fn max_of_strip<S: Simd>(
     }
 }
 
-/// `y[i]` becomes the maximum of itself and block `i` of a row.
+/// `y[i]` becomes the maximum of itself and the blocks `i` of all rows, each `w` long.
 #[inline(always)]
-fn max_of_blocks<const K: usize>(y: &mut [f32], row: &[f32]) {
-    for (y, block) in y.iter_mut().zip(row.as_chunks::<K>().0) {
-        let mut most = *y;
-        for &x in block {
-            most = if x > most { x } else { most };
+fn max_of_blocks<const K: usize>(y: &mut [f32], rows: &[f32], w: usize) {
+    for (strip, y) in y.chunks_mut(STRIP / K).enumerate() {
+        // Down the columns first, which takes whole vectors.
+        let mut most = [f32::NEG_INFINITY; STRIP];
+        for row in rows.chunks_exact(w) {
+            for (most, &x) in most.iter_mut().zip(&row[strip * STRIP..][..y.len() * K]) {
+                *most = if x > *most { x } else { *most };
+            }
         }
-        *y = most;
+        for (y, block) in y.iter_mut().zip(most.as_chunks::<K>().0) {
+            for &x in block {
+                *y = if x > *y { x } else { *y };
+            }
+        }
     }
 }
 

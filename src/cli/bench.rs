@@ -67,7 +67,7 @@ struct BenchResult {
     profile: Option<StepProfile>,
 }
 
-/// Where the time of a training step goes, summed over threads.
+/// Where the time of a training step goes: CPU time, summed over threads.
 #[derive(Serialize)]
 struct StepProfile {
     layers: Vec<LayerTime>,
@@ -204,7 +204,7 @@ impl StepProfile {
 
 /// The table of a training step, against the multiply-add peak of one core.
 fn print_profile(profile: &StepProfile, peak_gflops: f64) {
-    println!("\none training step, time summed over threads; GFLOP/s of one core, share of its peak");
+    println!("\none training step, CPU time of all threads; GFLOP/s of one core, share of its peak");
     println!("{:<28} {:^26}   {:^26}", "layers", "forward", "backward");
     let pass = |ms: f64, gflops: f64| match gflops {
         0.0 => format!("{ms:>8.2} ms {:>15}", ""),

@@ -23,7 +23,7 @@ impl StepTimes {
     }
 }
 
-/// The time that one stage, layers that run as one, took in all steps so far, summed over threads.
+/// The time that one stage, layers that run as one, took in all steps so far: CPU time, summed over threads.
 #[derive(Clone, Debug, PartialEq)]
 pub struct StageTime {
     /// The layers' names, joined by `+`.

@@ -22,8 +22,8 @@ pub(super) struct Profile {
     pub waiting: Stopwatch,
 }
 
-/// Where the time of a run went, since the process began with it. Seconds of work are summed over threads: on two threads
-/// that are never idle they grow by two a second.
+/// Where the time of a run went, since the process began with it. Seconds of work are CPU time of the threads, summed: on two
+/// threads that are never idle they grow by two a second.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ProfileReport {
@@ -45,7 +45,8 @@ pub struct ProfileReport {
     pub update_s: f64,
     /// The network on the validation side.
     pub evaluation_s: f64,
-    /// The rest of `threads` times `wall_s`: reading logs, writing models, and threads that were idle.
+    /// The rest of `threads` times `wall_s`: reading logs, writing models, waiting for the disk or for
+    /// other programs, and threads that were idle.
     pub other_s: f64,
     /// Wall time in which the network was done with a batch and the next one was not ready.
     pub waiting_for_data_s: f64,
