@@ -248,6 +248,7 @@ impl TrainingPlan {
     ) {
         let TrainingPlan { shards, spare, stages, moments, moments_of, first_learning, times, .. } = self;
         let first_learning = *first_learning;
+        let spare = &*spare;
         let spare = || spare.lock().unwrap_or_else(PoisonError::into_inner);
         let run = Run { network, parameters, stages, moments, moments_of, first_learning, input, times };
         shards[..used].par_iter_mut().for_each(|shard| {
