@@ -52,11 +52,12 @@ per_isa! {
         for (x, y) in x.chunks_exact(h * w).zip(y.chunks_exact_mut(out_h * out_w)).take(n * c) {
             for (oy, y) in y.chunks_exact_mut(out_w).enumerate() {
                 y.fill(f32::NEG_INFINITY);
-                let rows = &x[oy * stride_h * w..][..kh * w];
-                match (kw, stride_w) {
-                    (2, 2) => max_of_blocks::<2>(y, rows, w),
-                    (4, 4) => max_of_blocks::<4>(y, rows, w),
-                    _ => rows.chunks_exact(w).for_each(|row| max_of_windows(y, row, kw, stride_w)),
+                for row in x[oy * stride_h * w..].chunks_exact(w).take(kh) {
+                    match (kw, stride_w) {
+                        (2, 2) => max_of_blocks::<2>(y, row),
+                        (4, 4) => max_of_blocks::<4>(y, row),
+                        _ => max_of_windows(y, row, kw, stride_w),
+                    }
                 }
             }
         }
@@ -98,7 +99,7 @@ per_isa! {
     }
 }
 
-/// Columns at a time.
+/// Columns at a time, in [`max_forward_with_places`].
 const STRIP: usize = 64;
 
 /// A row of at most `STRIP / 4` windows of 4 columns and `kh` rows, the first of which begins at `rows[0]`, the place
@@ -154,22 +155,15 @@ fn max_of_strip<S: Simd>(
     }
 }
 
-/// `y[i]` becomes the maximum of itself and the blocks `i` of all rows, each `w` long.
+/// `y[i]` becomes the maximum of itself and block `i` of a row.
 #[inline(always)]
-fn max_of_blocks<const K: usize>(y: &mut [f32], rows: &[f32], w: usize) {
-    for (strip, y) in y.chunks_mut(STRIP / K).enumerate() {
-        // Down the columns first, which takes whole vectors.
-        let mut most = [f32::NEG_INFINITY; STRIP];
-        for row in rows.chunks_exact(w) {
-            for (most, &x) in most.iter_mut().zip(&row[strip * STRIP..][..y.len() * K]) {
-                *most = if x > *most { x } else { *most };
-            }
+fn max_of_blocks<const K: usize>(y: &mut [f32], row: &[f32]) {
+    for (y, block) in y.iter_mut().zip(row.as_chunks::<K>().0) {
+        let mut most = *y;
+        for &x in block {
+            most = if x > most { x } else { most };
         }
-        for (y, block) in y.iter_mut().zip(most.as_chunks::<K>().0) {
-            for &x in block {
-                *y = if x > *y { x } else { *y };
-            }
-        }
+        *y = most;
     }
 }
 
