@@ -170,6 +170,7 @@ pub mod recipe;
 pub mod report;
 pub mod serve;
 pub mod simulator;
+pub mod stopwatch;
 pub mod tensor;
 pub mod training;
 

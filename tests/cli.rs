@@ -55,6 +55,29 @@ fn first_image(folder: &Path, camera: &str) -> String {
 }
 
 #[test]
+fn a_profile_adds_up_and_changes_no_weight() {
+    let folder = folder_with_log(300);
+    let plain = json(folder.path(), &[&QUICK[..], &["--out", "plain"]].concat());
+    assert!(plain.get("profile").is_none(), "{plain}");
+    let measured = json(folder.path(), &[&QUICK[..], &["--out", "measured", "--profile", "--threads", "2"]].concat());
+    assert_eq!(measured["weights_hash"], plain["weights_hash"]);
+
+    let profile = &measured["profile"];
+    for key in ["decode_s", "preprocess_s", "forward_s", "backward_s", "update_s", "evaluation_s", "waiting_for_data_s"]
+    {
+        assert!(number(profile, key) > 0.0, "{key}: {profile}");
+    }
+    assert_eq!((number(profile, "augment_s"), number(profile, "threads")), (0.0, 2.0), "lenet does not augment");
+    let parts = ["decode", "preprocess", "augment", "forward", "backward", "update", "evaluation", "other"];
+    let sum: f64 = parts.iter().map(|part| number(profile, &format!("{part}_s"))).sum();
+    let capacity = 2.0 * number(profile, "wall_s");
+    assert!((sum - capacity).abs() < 0.01 * capacity, "{profile}");
+    if let Some(busy) = profile["busy_percent"].as_f64() {
+        assert!(busy > 0.0 && busy < 150.0, "{profile}");
+    }
+}
+
+#[test]
 fn evaluation_says_when_rows_were_trained_on_and_only_then() {
     let folder = folder_with_log(200);
     let other = folder.path().join("other");
@@ -182,9 +205,11 @@ fn summary_prints_the_table_of_the_write_up() {
     }
 }
 
+const BENCH: [&str; 8] = ["bench", "--recipe", "lenet", "--batch", "16", "--seconds", "0.05", "--json"];
+
 #[test]
 fn bench_prints_every_figure() {
-    let result = json(Path::new("."), &["bench", "--recipe", "lenet", "--batch", "16", "--seconds", "0.05", "--json"]);
+    let result = json(Path::new("."), &[&BENCH[..], &["--profile"]].concat());
     for key in [
         "train_images_per_second",
         "train_gflops",
@@ -199,4 +224,12 @@ fn bench_prints_every_figure() {
     }
     assert!(number(&result, "infer_us_p99") >= number(&result, "infer_us_p50"));
     assert!(result["isa"].is_string());
+    let layers = result["profile"]["layers"].as_array().unwrap();
+    let names: Vec<&str> = layers.iter().map(|layer| layer["layers"].as_str().unwrap()).collect();
+    assert_eq!(names[..4], ["scale1", "conv1+elu1+pool1", "conv2+elu2+pool2", "dense1"]);
+    for key in ["forward_ms", "backward_ms", "forward_gflops", "backward_gflops"] {
+        assert!(number(&layers[1], key) > 0.0, "{key}: {result}");
+    }
+    assert_eq!(number(&layers[0], "forward_gflops"), 0.0, "scaling multiplies nothing");
+    assert!(number(&result["profile"], "update_ms") > 0.0, "{result}");
 }

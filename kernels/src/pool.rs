@@ -1,6 +1,6 @@
 //! Maximum and average pooling over windows that lie fully inside the image (no padding, sizes rounded down).
 
-use crate::simd::{Simd, get, put};
+use crate::simd::{Simd, get, get_first, put};
 
 /// The sizes of a pooling layer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -129,13 +129,17 @@ fn max_of_strip<S: Simd>(
         put(simd, &mut most, at, best);
         put(simd, &mut row_of, at, best_row);
     }
-    for at in whole..columns {
-        for ky in 0..kh {
-            let x = rows[ky * w + at];
-            if x > most[at] {
-                (most[at], row_of[at]) = (x, ky as f32);
-            }
+    if whole < columns {
+        // What the lanes after the last column hold is not looked at.
+        let rest = columns - whole;
+        let (mut best, mut best_row) = (get_first(simd, rows, whole, rest), simd.splat(0.0));
+        for ky in 1..kh {
+            let x = get_first(simd, rows, ky * w + whole, rest);
+            best_row = simd.select_greater(x, best, simd.splat(ky as f32), best_row);
+            best = simd.select_greater(x, best, x, best);
         }
+        put(simd, &mut most, whole, best);
+        put(simd, &mut row_of, whole, best_row);
     }
     // Then across the four columns of each window; of equal values the one in the upper row, then the left one.
     let windows = most.as_chunks::<4>().0.iter().zip(row_of.as_chunks::<4>().0);

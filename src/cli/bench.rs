@@ -10,10 +10,11 @@ use steersman_kernels::peak::measure_peak_gflops;
 
 use super::{RecipeArgs, pool, print_json};
 use crate::error::{Error, Result};
-use crate::network::{InferencePlan, Network, Parameters, StepInput, TrainingPlan};
+use crate::network::{InferencePlan, Network, Parameters, StageTime, StepInput, TrainingPlan};
 use crate::optimizer::Optimizer;
 use crate::random::{Purpose, rng, uniform};
 use crate::recipe::Recipe;
+use crate::stopwatch::Stopwatch;
 
 /// Largest batch: beyond it, eight of them do not fit into memory.
 const MAX_BATCH: usize = 16_384;
@@ -35,6 +36,9 @@ pub struct BenchArgs {
     /// Seconds for each of the measurements
     #[arg(long, default_value_t = 3.0)]
     seconds: f64,
+    /// Also measure how long each layer takes, forward and backward, in training steps
+    #[arg(long)]
+    profile: bool,
     /// Print one JSON object as the last line
     #[arg(long)]
     json: bool,
@@ -58,6 +62,30 @@ struct BenchResult {
     peak_rss_mb: Option<f64>,
     isa: &'static str,
     threads: usize,
+    /// With `--profile`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    profile: Option<StepProfile>,
+}
+
+/// Where the time of a training step goes: CPU time, summed over threads.
+#[derive(Serialize)]
+struct StepProfile {
+    layers: Vec<LayerTime>,
+    /// Adding up gradients and the optimizer's step.
+    update_ms: f64,
+    /// The rest of threads times wall time: batch-norm sums put together, waiting at barriers.
+    other_ms: f64,
+}
+
+/// What layers that run as one take of a training step.
+#[derive(Serialize)]
+struct LayerTime {
+    layers: String,
+    forward_ms: f64,
+    /// 10^9 operations a second on one core, two a multiply-add; 0 for layers without multiply-adds.
+    forward_gflops: f64,
+    backward_ms: f64,
+    backward_gflops: f64,
 }
 
 pub fn run(args: BenchArgs, started: Instant) -> Result<()> {
@@ -85,6 +113,9 @@ pub fn run(args: BenchArgs, started: Instant) -> Result<()> {
     if let Some(megabytes) = result.peak_rss_mb {
         println!("peak memory   {megabytes:>9.0} MB");
     }
+    if let Some(profile) = &result.profile {
+        print_profile(profile, result.peak_gflops / result.threads as f64);
+    }
     Ok(())
 }
 
@@ -98,24 +129,37 @@ fn measure(recipe: &Recipe, args: &BenchArgs, started: Instant) -> Result<BenchR
     let mut plan = TrainingPlan::new(&network, args.batch);
     let mut optimizer = Optimizer::new(recipe.optimizer, recipe.clip_gradient_norm, &network);
     let mut step = 0;
-    let mut train_step = |x: &[Vec<f32>], parameters: &mut Parameters| {
-        let batch = step % BATCHES;
-        let input = StepInput { x: &x[batch], labels: &labels[batch], seed: 1, step: step as u64 };
-        plan.step(&network, parameters, &recipe.loss, input);
-        let norm = plan.gradient_norm();
-        optimizer.step(recipe.optimizer.learning_rate(), &mut parameters.values, plan.gradient_mut(), norm);
-        step += 1;
-    };
-    train_step(&x, &mut parameters);
+    let mut train_step =
+        |plan: &mut TrainingPlan, optimizer: &mut Optimizer, x: &[Vec<f32>], parameters: &mut Parameters| {
+            let batch = step % BATCHES;
+            let input = StepInput { x: &x[batch], labels: &labels[batch], seed: 1, step: step as u64 };
+            plan.step(&network, parameters, &recipe.loss, input);
+            let norm = plan.gradient_norm();
+            optimizer.step(recipe.optimizer.learning_rate(), &mut parameters.values, plan.gradient_mut(), norm);
+            step += 1;
+        };
+    train_step(&mut plan, &mut optimizer, &x, &mut parameters);
     let first_step_s = started.elapsed().as_secs_f64();
     x.extend((1..BATCHES).map(|batch| random_numbers(args.batch * network.input().len(), batch as u64)));
 
     let (mut steps, training) = (0, Instant::now());
     while training.elapsed().as_secs_f64() < args.seconds {
-        train_step(&x, &mut parameters);
+        train_step(&mut plan, &mut optimizer, &x, &mut parameters);
         steps += 1;
     }
     let train_images_per_second = (steps * args.batch) as f64 / training.elapsed().as_secs_f64();
+    let profile = args.profile.then(|| {
+        let update = Stopwatch::on();
+        plan.measure(update.clone());
+        optimizer.measure(update.clone());
+        let (mut steps, started) = (0, Instant::now());
+        while steps == 0 || started.elapsed().as_secs_f64() < args.seconds {
+            train_step(&mut plan, &mut optimizer, &x, &mut parameters);
+            steps += 1;
+        }
+        let thread_s = started.elapsed().as_secs_f64() * rayon::current_num_threads() as f64;
+        StepProfile::of(&plan.stage_times(&network), update.seconds(), thread_s, steps, args.batch)
+    });
 
     let infer_images_per_second = infer_throughput(&network, &parameters, &x, args);
     let (infer_us_p50, infer_us_p99) = infer_latency(&network, &parameters, &x[0], args.seconds);
@@ -131,7 +175,47 @@ fn measure(recipe: &Recipe, args: &BenchArgs, started: Instant) -> Result<BenchR
         peak_rss_mb: peak_rss_mb(),
         isa: network.isa().name(),
         threads: rayon::current_num_threads(),
+        profile,
     })
+}
+
+impl StepProfile {
+    /// Of `steps` steps with `batch` images that took `thread_s` seconds times threads.
+    fn of(stages: &[StageTime], update_s: f64, thread_s: f64, steps: usize, batch: usize) -> StepProfile {
+        let ms = |seconds: f64| 1e3 * seconds / steps as f64;
+        let gflops = |multiply_adds: u64, seconds: f64| {
+            if seconds > 0.0 { 2e-9 * multiply_adds as f64 * (steps * batch) as f64 / seconds } else { 0.0 }
+        };
+        let layers = stages.iter().map(|stage| LayerTime {
+            layers: stage.layers.clone(),
+            forward_ms: ms(stage.forward_s),
+            forward_gflops: gflops(stage.forward_multiply_adds, stage.forward_s),
+            backward_ms: ms(stage.backward_s),
+            backward_gflops: gflops(stage.backward_multiply_adds, stage.backward_s),
+        });
+        let in_stages: f64 = stages.iter().map(|stage| stage.forward_s + stage.backward_s).sum();
+        StepProfile {
+            layers: layers.collect(),
+            update_ms: ms(update_s),
+            other_ms: ms((thread_s - in_stages - update_s).max(0.0)),
+        }
+    }
+}
+
+/// The table of a training step, against the multiply-add peak of one core.
+fn print_profile(profile: &StepProfile, peak_gflops: f64) {
+    println!("\none training step, CPU time of all threads; GFLOP/s of one core, share of its peak");
+    println!("{:<28} {:^26}   {:^26}", "layers", "forward", "backward");
+    let pass = |ms: f64, gflops: f64| match gflops {
+        0.0 => format!("{ms:>8.2} ms {:>15}", ""),
+        _ => format!("{ms:>8.2} ms {gflops:>7.1} {:>5.1} %", 100.0 * gflops / peak_gflops),
+    };
+    for LayerTime { layers, forward_ms, forward_gflops, backward_ms, backward_gflops } in &profile.layers {
+        println!("{layers:<28} {}   {}", pass(*forward_ms, *forward_gflops), pass(*backward_ms, *backward_gflops));
+    }
+    for (name, ms) in [("gradient sums and optimizer", profile.update_ms), ("other, idle", profile.other_ms)] {
+        println!("{name:<28} {}", pass(ms, 0.0));
+    }
 }
 
 /// Numbers in [-0.5, 0.5), drawn on all threads.

@@ -27,6 +27,8 @@ pub struct Progress {
     batch_losses: Vec<f64>,
     /// Of the epochs that are done: training and validation loss.
     losses: [Vec<f64>; 2],
+    /// Whether the run is to measure where its time goes.
+    profile: bool,
 }
 
 impl Progress {
@@ -44,7 +46,13 @@ impl Progress {
             last_line: now,
             batch_losses: Vec::new(),
             losses: Default::default(),
+            profile: false,
         }
+    }
+
+    /// The same, for a run that measures where its time goes if `profile` says so.
+    pub fn with_profile(self, profile: bool) -> Progress {
+        Progress { profile, ..self }
     }
 
     fn print(&self, text: &str) {
@@ -70,6 +78,10 @@ impl Progress {
 impl Observer for Progress {
     fn notice(&mut self, text: &str) {
         self.print(text);
+    }
+
+    fn wants_profile(&self) -> bool {
+        self.profile
     }
 
     fn progress(&mut self, epoch: u32, images: usize, of: usize, loss: f64) {

@@ -56,6 +56,9 @@ pub struct TrainArgs {
     /// Train on recordings of held-out tracks all the same
     #[arg(long, requires = "recordings")]
     force_held_out: bool,
+    /// Say at the end where the time went: decoding, forward, backward and so on, and how busy the cores were
+    #[arg(long)]
+    profile: bool,
     /// Print one JSON object as the last line
     #[arg(long)]
     json: bool,
@@ -68,7 +71,7 @@ pub fn run(args: TrainArgs) -> Result<()> {
     }
     let stop = stop_on_ctrl_c()?;
     let pool = pool(args.threads)?;
-    let mut progress = Progress::new();
+    let mut progress = Progress::new().with_profile(args.profile);
     let from = args.from.map(|model| TransferRequest { model, freeze: args.freeze });
     let recipe = || match &from {
         Some(from) => args.recipe.find_or_of(&from.model),
@@ -187,6 +190,9 @@ fn print_training(result: &TrainResult) {
     );
     if !result.trained_on_held_out.is_empty() {
         println!("note: the model was {}", trained_on_held_out(&result.trained_on_held_out));
+    }
+    if let Some(profile) = &result.profile {
+        println!("{}", profile.table());
     }
     println!("model {}", result.model.display());
 }

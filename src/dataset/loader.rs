@@ -13,6 +13,7 @@ use super::recording::{Camera, Recording};
 use super::samples::{Flip, Group, Item, SampleSpec};
 use super::split::Split;
 use crate::random::{Purpose, rng, shuffle, unit};
+use crate::stopwatch::Stopwatch;
 use crate::{Error, Result};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
@@ -85,6 +86,18 @@ pub struct Loader {
     thumbnails: Vec<OnceLock<Thumbnail>>,
     undecodable: Mutex<BTreeMap<u32, String>>,
     scratch: Mutex<Vec<Scratch>>,
+    times: LoaderTimes,
+}
+
+/// Where the time of making samples goes, summed over threads; nothing is measured by default.
+#[derive(Debug, Clone, Default)]
+pub struct LoaderTimes {
+    /// Reading and decoding files.
+    pub decode: Stopwatch,
+    /// Crop, size, colour, scaling, mirroring.
+    pub preprocess: Stopwatch,
+    /// Random changes.
+    pub augment: Stopwatch,
 }
 
 /// Buffers of one thread.
@@ -168,10 +181,16 @@ impl Loader {
             epoch: 0,
             undecodable: Mutex::default(),
             scratch: Mutex::default(),
+            times: LoaderTimes::default(),
             spec: spec.clone(),
         };
         loader.begin_epoch(0);
         Ok(loader)
+    }
+
+    /// Adds the time that samples take from now on to `times`.
+    pub fn measure(&mut self, times: &LoaderTimes) {
+        self.times = times.clone();
     }
 
     /// Number of images, mirrors not counted.
@@ -284,19 +303,26 @@ impl Loader {
         let preprocessing = &self.spec.preprocessing;
         let (item, camera) = self.images[image as usize];
         let mut label = self.spec.samples.label(self.items[item as usize].steering(&self.recordings), camera);
-        if keeps_rgb(&self.spec, self.training) {
-            rgb.copy_from_slice(made);
-            let mut rng = rng(self.spec.seed, Purpose::Augment, self.epoch, u64::from(sample));
-            label += self.spec.augmentation.apply(preprocessing, rgb, &mut rng);
-            preprocessor.finish(rgb, planes);
-        } else {
-            planes.copy_from_slice(made);
+        let augmented = keeps_rgb(&self.spec, self.training);
+        if augmented {
+            label += self.times.augment.time(|| {
+                rgb.copy_from_slice(made);
+                let mut rng = rng(self.spec.seed, Purpose::Augment, self.epoch, u64::from(sample));
+                self.spec.augmentation.apply(preprocessing, rgb, &mut rng)
+            });
         }
-        if self.is_mirrored(sample) {
-            planes.chunks_exact_mut(preprocessing.resize[1]).for_each(<[u8]>::reverse);
-            label = -label;
-        }
-        preprocessing.to_input(planes, x);
+        self.times.preprocess.time(|| {
+            if augmented {
+                preprocessor.finish(rgb, planes);
+            } else {
+                planes.copy_from_slice(made);
+            }
+            if self.is_mirrored(sample) {
+                planes.chunks_exact_mut(preprocessing.resize[1]).for_each(<[u8]>::reverse);
+                label = -label;
+            }
+            preprocessing.to_input(planes, x);
+        });
         Ok(Some(label))
     }
 
@@ -321,9 +347,13 @@ impl Loader {
         let Item { recording, row, .. } = self.items[item as usize];
         let path = self.recordings[usize::from(recording)].image_path(row as usize, camera).ok_or("no such image")?;
         let failed = |message: String| format!("{}: {message}", path.display());
-        file.clear();
-        File::open(&path).and_then(|mut input| input.read_to_end(file)).map_err(|error| failed(error.to_string()))?;
-        decode_rgb(file, decoded).map_err(failed)?;
+        self.times.decode.time(|| {
+            file.clear();
+            File::open(&path)
+                .and_then(|mut input| input.read_to_end(file))
+                .map_err(|error| failed(error.to_string()))?;
+            decode_rgb(file, decoded).map_err(failed)
+        })?;
         if preprocessor.image_size() != [decoded.height, decoded.width] {
             let planned = self.spec.preprocessing.plan(decoded.height, decoded.width);
             *preprocessor = planned.map_err(|error| failed(error.to_string()))?;
@@ -332,11 +362,13 @@ impl Loader {
             let Preprocessing { rows, source, .. } = self.spec.preprocessing;
             self.thumbnails[item as usize].get_or_init(|| Thumbnail::of(decoded, rows, source[0]));
         }
-        if keeps_rgb(&self.spec, self.training) {
-            preprocessor.to_rgb_stage(&decoded.pixels, out);
-        } else {
-            preprocessor.apply(&decoded.pixels, out);
-        }
+        self.times.preprocess.time(|| {
+            if keeps_rgb(&self.spec, self.training) {
+                preprocessor.to_rgb_stage(&decoded.pixels, out);
+            } else {
+                preprocessor.apply(&decoded.pixels, out);
+            }
+        });
         Ok(())
     }
 

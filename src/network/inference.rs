@@ -9,6 +9,7 @@ use super::stages::{Kind, Stage, stages};
 use super::{LayerSpec, Network, Parameters};
 use crate::error::{Error, Result};
 use crate::layers::Prepared;
+use crate::stopwatch::Stopwatch;
 use crate::tensor::Shape;
 
 /// Images that a worker takes through the dense layers at a time.
@@ -28,6 +29,8 @@ pub struct InferencePlan {
     is_prepared: bool,
     workers: Vec<Worker>,
     capacity: usize,
+    /// Gets the time of all workers.
+    time: Stopwatch,
 }
 
 #[derive(Clone, Debug)]
@@ -67,7 +70,13 @@ impl InferencePlan {
             stages,
             maps,
             capacity,
+            time: Stopwatch::default(),
         }
+    }
+
+    /// Adds the time that workers take from now on to `time`.
+    pub fn measure(&mut self, time: Stopwatch) {
+        self.time = time;
     }
 
     /// Runs the network on `x`, `[n][c][h][w]`, and fills `y`, `[n][outputs]`. An image's output does not depend on the
@@ -103,17 +112,17 @@ impl InferencePlan {
         let n = x.len() / input;
         assert!(n <= self.capacity, "a batch of {n} images in a plan for {}", self.capacity);
         assert_eq!((x.len(), y.len()), (n * input, n * output));
-        let InferencePlan { stages, maps, prepared, workers, .. } = self;
+        let InferencePlan { stages, maps, prepared, workers, time, .. } = self;
         let run = Run { network, parameters, stages, maps: *maps, prepared };
         if n <= GROUP {
             for ((x, y), worker) in x.chunks(GROUP * input).zip(y.chunks_mut(GROUP * output)).zip(workers) {
-                run.group(worker, x, y);
+                time.time(|| run.group(worker, x, y));
             }
         } else {
             x.par_chunks(GROUP * input)
                 .zip(y.par_chunks_mut(GROUP * output))
                 .zip(workers)
-                .for_each(|((x, y), worker)| run.group(worker, x, y));
+                .for_each(|((x, y), worker)| time.time(|| run.group(worker, x, y)));
         }
     }
 }

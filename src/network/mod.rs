@@ -7,6 +7,7 @@ mod inference;
 mod observation;
 mod spec;
 mod stages;
+mod step_profile;
 mod training;
 
 use std::fmt::Write as _;
@@ -16,6 +17,7 @@ pub use inference::InferencePlan;
 pub use observation::ObservationPlan;
 pub use spec::LayerSpec;
 use steersman_kernels::Isa;
+pub use step_profile::StageTime;
 pub(crate) use training::CHUNK;
 pub use training::{StepInput, TrainingPlan};
 

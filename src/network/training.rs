@@ -8,14 +8,17 @@
 //! all: then a shard takes a few images at a time forward *and* backward, and their activations stay in the cache.
 
 use std::ops::Range;
+use std::sync::{Mutex, PoisonError};
 
 use rayon::prelude::*;
 use steersman_kernels::{Isa, update};
 
 use super::stages::{Kind, Stage, stages};
+use super::step_profile::{StageTime, StepTimes};
 use super::{Network, Parameters};
 use crate::layers::{BatchStatistics, Grads, Pair, Pass};
 use crate::loss::Loss;
+use crate::stopwatch::Stopwatch;
 
 /// Most shards a batch is cut into: enough to keep 16 threads busy.
 pub const MAX_SHARDS: usize = 16;
@@ -46,6 +49,8 @@ pub struct StepInput<'a> {
 #[derive(Debug)]
 pub struct TrainingPlan {
     shards: Vec<Shard>,
+    /// The buffers that no shard is using, in networks without a barrier; those used last are at the end.
+    spare: Mutex<Vec<Buffers>>,
     /// Gradient of the mean loss with respect to [`Parameters::values`].
     gradient: Vec<f32>,
     /// Sum of squares of each chunk of the gradient.
@@ -62,12 +67,26 @@ pub struct TrainingPlan {
     first_learning: usize,
     capacity: usize,
     isa: Isa,
+    times: StepTimes,
 }
 
-#[derive(Debug, Default)]
+#[derive(Debug)]
 struct Shard {
     /// Which images of the batch.
     images: Range<usize>,
+    /// Empty between the steps of a network without a barrier.
+    buffers: Buffers,
+    gradient: Vec<f32>,
+    sums: Vec<f64>,
+    /// Sum of the losses of all images.
+    loss: f64,
+}
+
+/// What a shard computes in. With a barrier the activations have to wait there, and each shard has its own. Without one a
+/// shard is done with them when it is done, and takes those that were used last: then no more of them are touched than threads
+/// are at work, which spares memory and the cache.
+#[derive(Debug, Default)]
+struct Buffers {
     /// Output of each stage.
     activations: Vec<Vec<f32>>,
     /// Where each [`Kind::PooledConv`] found its largest; empty for the others.
@@ -77,11 +96,7 @@ struct Shard {
     d_input: Vec<f32>,
     /// Whether the gradient with respect to the current stage's output has taken the place of that output instead.
     in_place: bool,
-    gradient: Vec<f32>,
-    sums: Vec<f64>,
     scratch: Vec<f32>,
-    /// Sum of the losses of all images.
-    loss: f64,
 }
 
 impl TrainingPlan {
@@ -121,25 +136,32 @@ impl TrainingPlan {
             (GROUP_NUMBERS / per_image.max(1)).clamp(MIN_GROUP.min(shard_capacity), shard_capacity)
         };
         let scratch_len = stages.iter().map(|stage| stage.scratch_len(network, group)).max().unwrap_or(0);
-        let shards = (0..capacity.min(MAX_SHARDS))
-            .map(|_| Shard {
-                images: 0..0,
+        let mut spare: Vec<Buffers> = (0..capacity.min(MAX_SHARDS))
+            .map(|_| Buffers {
                 activations: stages.iter().map(|stage| vec![0.0; group * stage.output_len(network)]).collect(),
                 places: stages.iter().map(|stage| vec![0; stage.places_len(network) * group]).collect(),
                 d_output: vec![0.0; group * largest],
                 d_input: vec![0.0; group * largest],
                 in_place: false,
+                scratch: vec![0.0; scratch_len],
+            })
+            .collect();
+        let shards = (0..capacity.min(MAX_SHARDS))
+            .map(|_| Shard {
+                images: 0..0,
+                buffers: if segments.len() > 1 { spare.pop().unwrap_or_default() } else { Buffers::default() },
                 gradient: vec![0.0; network.count(true)],
                 sums: vec![0.0; sums_len],
-                scratch: vec![0.0; scratch_len],
                 loss: 0.0,
             })
             .collect();
         TrainingPlan {
             shards,
+            spare: Mutex::new(spare),
             gradient: vec![0.0; network.count(true)],
             chunk_squares: vec![0.0; network.count(true).div_ceil(CHUNK)],
             first_learning: stages.iter().position(|stage| stage.learns(network)).unwrap_or(stages.len()),
+            times: StepTimes::off(stages.len()),
             stages,
             moments: vec![0.0; moments_end],
             moments_of,
@@ -163,6 +185,16 @@ impl TrainingPlan {
     /// L2 norm of the gradient, as it was after the last step.
     pub fn gradient_norm(&self) -> f64 {
         self.chunk_squares.iter().sum::<f64>().sqrt()
+    }
+
+    /// Measures from now on how long each stage takes; `reduce` gets the time for adding the shards' gradients up.
+    pub fn measure(&mut self, reduce: Stopwatch) {
+        self.times = StepTimes::on(self.stages.len(), reduce);
+    }
+
+    /// What [`measure`](TrainingPlan::measure) has found so far, in the order of the layers.
+    pub fn stage_times(&self, network: &Network) -> Vec<StageTime> {
+        StageTime::of(network, &self.stages, &self.times, self.first_learning)
     }
 
     /// Computes the mean loss of the batch and leaves its gradient in [`gradient`](TrainingPlan::gradient). Of the
@@ -214,10 +246,15 @@ impl TrainingPlan {
         input: StepInput,
         used: usize,
     ) {
-        let TrainingPlan { shards, stages, moments, moments_of, first_learning, .. } = self;
-        let run = Run { network, parameters, stages, moments, moments_of, first_learning: *first_learning, input };
+        let TrainingPlan { shards, spare, stages, moments, moments_of, first_learning, times, .. } = self;
+        let first_learning = *first_learning;
+        let spare = &*spare;
+        let spare = || spare.lock().unwrap_or_else(PoisonError::into_inner);
+        let run = Run { network, parameters, stages, moments, moments_of, first_learning, input, times };
         shards[..used].par_iter_mut().for_each(|shard| {
             shard.reset();
+            let buffers = spare().pop().expect("there are as many buffers as shards");
+            shard.buffers = buffers;
             let group = shard.group_capacity(network);
             for start in shard.images.clone().step_by(group) {
                 let images = start..(start + group).min(shard.images.end);
@@ -225,6 +262,8 @@ impl TrainingPlan {
                 run.loss(loss, shard, images.clone());
                 run.backward(0..stages.len(), shard, images);
             }
+            let buffers = std::mem::take(&mut shard.buffers);
+            spare().push(buffers);
         });
     }
 
@@ -236,7 +275,7 @@ impl TrainingPlan {
         input: StepInput,
         used: usize,
     ) {
-        let TrainingPlan { shards, stages, moments, moments_of, sums, segments, first_learning, .. } = self;
+        let TrainingPlan { shards, stages, moments, moments_of, sums, segments, first_learning, times, .. } = self;
         let first_learning = *first_learning;
         let shards = &mut shards[..used];
         let images = shards.last().map_or(0, |shard| shard.images.end);
@@ -246,7 +285,7 @@ impl TrainingPlan {
         let last = segments.len() - 1;
 
         for (index, segment) in segments.iter().enumerate() {
-            let run = Run { network, parameters, stages, moments, moments_of, first_learning, input };
+            let run = Run { network, parameters, stages, moments, moments_of, first_learning, input, times };
             let next_barrier = segments.get(index + 1).map(|next| next.start);
             shards.par_iter_mut().for_each(|shard| {
                 if index == 0 {
@@ -271,7 +310,7 @@ impl TrainingPlan {
             }
         }
         for (index, segment) in segments.iter().enumerate().rev() {
-            let run = Run { network, parameters, stages, moments, moments_of, first_learning, input };
+            let run = Run { network, parameters, stages, moments, moments_of, first_learning, input, times };
             // The stage at the start of a segment waits for the sums over all shards.
             let rest = if index > 0 { segment.start + 1..segment.end } else { segment.clone() };
             shards.par_iter_mut().for_each(|shard| {
@@ -296,22 +335,24 @@ impl TrainingPlan {
 
     /// Adds the shards' gradients up, in their order. Those of frozen layers count as 0.
     fn reduce_gradient(&mut self, network: &Network, used: usize) {
-        let TrainingPlan { shards, gradient, chunk_squares, isa, .. } = self;
+        let TrainingPlan { shards, gradient, chunk_squares, isa, times, .. } = self;
         let shards = &shards[..used];
         gradient.par_chunks_mut(CHUNK).zip(chunk_squares.par_iter_mut()).enumerate().for_each(
             |(index, (chunk, squares))| {
-                let range = index * CHUNK..index * CHUNK + chunk.len();
-                chunk.copy_from_slice(&shards[0].gradient[range.clone()]);
-                for shard in &shards[1..] {
-                    update::sum_into(*isa, chunk, &shard.gradient[range.clone()]);
-                }
-                for layer in network.layers().iter().filter(|layer| layer.frozen) {
-                    let (from, to) = (layer.params.start.max(range.start), layer.params.end.min(range.end));
-                    if from < to {
-                        chunk[from - range.start..to - range.start].fill(0.0);
+                times.reduce.time(|| {
+                    let range = index * CHUNK..index * CHUNK + chunk.len();
+                    chunk.copy_from_slice(&shards[0].gradient[range.clone()]);
+                    for shard in &shards[1..] {
+                        update::sum_into(*isa, chunk, &shard.gradient[range.clone()]);
                     }
-                }
-                *squares = update::sum_of_squares(*isa, chunk);
+                    for layer in network.layers().iter().filter(|layer| layer.frozen) {
+                        let (from, to) = (layer.params.start.max(range.start), layer.params.end.min(range.end));
+                        if from < to {
+                            chunk[from - range.start..to - range.start].fill(0.0);
+                        }
+                    }
+                    *squares = update::sum_of_squares(*isa, chunk);
+                })
             },
         );
     }
@@ -325,12 +366,12 @@ impl Shard {
 
     /// How many images the activations have room for.
     fn group_capacity(&self, network: &Network) -> usize {
-        self.activations.last().map_or(self.images.len(), |last| last.len() / network.output().len()).max(1)
+        self.buffers.activations.last().map_or(self.images.len(), |last| last.len() / network.output().len()).max(1)
     }
 
     /// Output of stage `stage` and of its source, which comes before it.
     fn source_and_output(&mut self, stage: usize, source: usize) -> (&mut [f32], &mut [f32]) {
-        let (before, from_here) = self.activations.split_at_mut(stage);
+        let (before, from_here) = self.buffers.activations.split_at_mut(stage);
         (&mut before[source], &mut from_here[0])
     }
 }
@@ -370,6 +411,7 @@ struct Run<'a> {
     moments_of: &'a [Range<usize>],
     first_learning: usize,
     input: StepInput<'a>,
+    times: &'a StepTimes,
 }
 
 impl<'a> Run<'a> {
@@ -398,36 +440,37 @@ impl<'a> Run<'a> {
     fn forward(&self, stages: Range<usize>, shard: &mut Shard, images: Range<usize>) {
         for index in stages {
             let stage = &self.stages[index];
-            let (before, from_here) = shard.activations.split_at_mut(index);
+            let (before, from_here) = shard.buffers.activations.split_at_mut(index);
             let x = self.stage_input(index, before, images.clone());
             let n = images.len();
             let y = &mut from_here[0][..n * stage.output_len(self.network)];
             let (params, pass) = (self.params(index), self.pass(index, images.start));
-            match &stage.kind {
+            self.times.stages[index][0].time(|| match &stage.kind {
                 Kind::Layer => {
                     let layer = &self.network.layers()[stage.layers.start].layer;
-                    layer.forward(params, &pass, n, x, y, &mut shard.scratch);
+                    layer.forward(params, &pass, n, x, y, &mut shard.buffers.scratch);
                 }
                 Kind::NormRectify(fused) => fused.forward(params, &pass, n, x, y),
                 Kind::PooledConv(fused) => {
-                    let places = &mut shard.places[index][..y.len()];
-                    fused.forward(params, n, x, y, places, &mut shard.scratch);
+                    let places = &mut shard.buffers.places[index][..y.len()];
+                    fused.forward(params, n, x, y, places, &mut shard.buffers.scratch);
                 }
-            }
+            });
         }
     }
 
     /// Adds the images' losses to the shard's, and puts the gradient of the mean loss into `d_output`.
     fn loss(&self, loss: &Loss, shard: &mut Shard, images: Range<usize>) {
         let outputs = self.network.output().len();
-        let predictions = match shard.activations.last() {
+        let predictions = match shard.buffers.activations.last() {
             Some(last) => &last[..images.len() * outputs],
             None => &self.input.x[images.start * outputs..images.end * outputs],
         };
         let labels = &self.input.labels[images.start * outputs..images.end * outputs];
         let scale = 1.0 / self.input.labels.len() as f32;
-        shard.loss += loss.value_and_gradient(predictions, labels, scale, &mut shard.d_output[..predictions.len()]);
-        shard.in_place = false;
+        shard.loss +=
+            loss.value_and_gradient(predictions, labels, scale, &mut shard.buffers.d_output[..predictions.len()]);
+        shard.buffers.in_place = false;
     }
 
     /// Takes the gradient of the output of the last of `stages` back to the input of the first.
@@ -440,63 +483,74 @@ impl<'a> Run<'a> {
             let replaces = stage.source.filter(|_| replaces_input(self.network, self.stages, index));
             // Nobody asks for the gradient of the images themselves, or of what comes before all that learns.
             let wanted = stage.source.filter(|source| *source >= self.first_learning);
-            match &stage.kind {
+            self.times.stages[index][1].time(|| match &stage.kind {
                 Kind::NormRectify(fused) => {
                     let source = replaces.expect("batch norm runs fused only after another stage");
-                    let (in_place, d_output) = (shard.in_place, std::mem::take(&mut shard.d_output));
+                    let (in_place, d_output) = (shard.buffers.in_place, std::mem::take(&mut shard.buffers.d_output));
                     let (x, y) = shard.source_and_output(index, source);
                     let dy = if in_place { &y[..y_len] } else { &d_output[..y_len] };
                     fused.backward(params, &pass, n, &mut x[..x_len], dy);
-                    shard.d_output = d_output;
+                    shard.buffers.d_output = d_output;
                 }
                 Kind::PooledConv(fused) => {
-                    let x = self.stage_input(index, &shard.activations, images.clone());
-                    let pair = Pair { x, y: &shard.activations[index][..y_len], dy: &shard.d_output[..y_len] };
-                    let dx = wanted.map(|_| &mut shard.d_input[..x_len]);
+                    let x = self.stage_input(index, &shard.buffers.activations, images.clone());
+                    let pair =
+                        Pair { x, y: &shard.buffers.activations[index][..y_len], dy: &shard.buffers.d_output[..y_len] };
+                    let dx = wanted.map(|_| &mut shard.buffers.d_input[..x_len]);
                     let dparams = &mut shard.gradient[stage.params(self.network)];
-                    let grads = Grads { dparams, scratch: &mut shard.scratch };
-                    fused.backward(params, n, pair, &shard.places[index][..y_len], dx, grads);
+                    let grads = Grads { dparams, scratch: &mut shard.buffers.scratch };
+                    fused.backward(params, n, pair, &shard.buffers.places[index][..y_len], dx, grads);
                 }
                 Kind::Layer => {
                     let layer = &self.network.layers()[stage.layers.start].layer;
-                    let x = self.stage_input(index, &shard.activations, images.clone());
-                    let y = &shard.activations[index][..y_len];
-                    let pair = Pair { x, y, dy: if shard.in_place { y } else { &shard.d_output[..y_len] } };
+                    let x = self.stage_input(index, &shard.buffers.activations, images.clone());
+                    let y = &shard.buffers.activations[index][..y_len];
+                    let pair =
+                        Pair { x, y, dy: if shard.buffers.in_place { y } else { &shard.buffers.d_output[..y_len] } };
                     let apart = wanted.is_some() && replaces.is_none();
-                    let dx = if apart { Some(&mut shard.d_input[..x_len]) } else { None };
+                    let dx = if apart { Some(&mut shard.buffers.d_input[..x_len]) } else { None };
                     let dparams = &mut shard.gradient[stage.params(self.network)];
-                    layer.backward(params, &pass, n, pair, dx, Grads { dparams, scratch: &mut shard.scratch });
+                    layer.backward(params, &pass, n, pair, dx, Grads { dparams, scratch: &mut shard.buffers.scratch });
                     if let (Some(linear), Some(source)) = (layer.linear(), replaces.and(wanted)) {
-                        let (before, from_here) = shard.activations.split_at_mut(index);
-                        let dy = if shard.in_place { &from_here[0][..y_len] } else { &shard.d_output[..y_len] };
-                        linear.backward_input(params, n, dy, &mut before[source][..x_len], &mut shard.scratch);
+                        let (before, from_here) = shard.buffers.activations.split_at_mut(index);
+                        let dy = if shard.buffers.in_place {
+                            &from_here[0][..y_len]
+                        } else {
+                            &shard.buffers.d_output[..y_len]
+                        };
+                        linear.backward_input(params, n, dy, &mut before[source][..x_len], &mut shard.buffers.scratch);
                     }
                 }
-            }
-            shard.in_place = replaces.is_some();
-            if !shard.in_place {
-                std::mem::swap(&mut shard.d_output, &mut shard.d_input);
+            });
+            shard.buffers.in_place = replaces.is_some();
+            if !shard.buffers.in_place {
+                std::mem::swap(&mut shard.buffers.d_output, &mut shard.buffers.d_input);
             }
         }
     }
 
     fn forward_sums(&self, stage: usize, barrier: &dyn BatchStatistics, shard: &mut Shard) {
-        let x = self.stage_input(stage, &shard.activations, shard.images.clone());
-        barrier.forward_sums(shard.images.len(), x, &mut shard.sums[..barrier.sums_len()]);
+        let x = self.stage_input(stage, &shard.buffers.activations, shard.images.clone());
+        let sums = &mut shard.sums[..barrier.sums_len()];
+        self.times.stages[stage][0].time(|| barrier.forward_sums(shard.images.len(), x, sums));
     }
 
     fn backward_sums(&self, index: usize, barrier: &dyn BatchStatistics, shard: &mut Shard) {
         let stage = &self.stages[index];
         let n = shard.images.len();
-        let x = self.stage_input(index, &shard.activations, shard.images.clone());
+        let x = self.stage_input(index, &shard.buffers.activations, shard.images.clone());
         let y_len = n * stage.output_len(self.network);
-        let dy = if shard.in_place { &shard.activations[index][..y_len] } else { &shard.d_output[..y_len] };
+        let dy = if shard.buffers.in_place {
+            &shard.buffers.activations[index][..y_len]
+        } else {
+            &shard.buffers.d_output[..y_len]
+        };
         let sums = &mut shard.sums[..barrier.sums_len()];
         let moments = self.pass(index, shard.images.start).moments;
         let dparams = &mut shard.gradient[stage.params(self.network)];
-        match &stage.kind {
+        self.times.stages[index][1].time(|| match &stage.kind {
             Kind::Layer | Kind::PooledConv(_) => barrier.backward_sums(moments, n, x, dy, sums, dparams),
             Kind::NormRectify(fused) => fused.backward_sums(self.params(index), moments, x, dy, sums, dparams),
-        }
+        });
     }
 }

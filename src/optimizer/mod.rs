@@ -18,6 +18,7 @@ use serde::{Deserialize, Serialize};
 use steersman_kernels::update::{AdamStep, adam, scale, sgd_momentum};
 
 use crate::network::{CHUNK, Network};
+use crate::stopwatch::Stopwatch;
 
 /// How parameters follow the gradient.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -131,6 +132,8 @@ pub struct Optimizer {
     /// Where the pieces of each chunk lie.
     pieces_of_chunk: Vec<Range<usize>>,
     isa: steersman_kernels::Isa,
+    /// Gets the time of all updates.
+    time: Stopwatch,
 }
 
 #[derive(Clone, Debug)]
@@ -163,7 +166,22 @@ impl Optimizer {
             OptimizerSpec::Sgd { .. } => Vec::new(),
         };
         let isa = network.isa();
-        Optimizer { spec, clip_norm, updates: 0, first: vec![0.0; count], second, pieces, pieces_of_chunk, isa }
+        Optimizer {
+            spec,
+            clip_norm,
+            updates: 0,
+            first: vec![0.0; count],
+            second,
+            pieces,
+            pieces_of_chunk,
+            isa,
+            time: Stopwatch::default(),
+        }
+    }
+
+    /// Adds the time that updates take from now on to `time`.
+    pub fn measure(&mut self, time: Stopwatch) {
+        self.time = time;
     }
 
     /// One update of all `params` along `gradient`, whose L2 norm is `gradient_norm`, with learning rate `lr`. A gradient
@@ -172,10 +190,10 @@ impl Optimizer {
     /// The clock goes on by one for the whole update, not once a tensor. Allocates nothing inside a rayon pool.
     pub fn step(&mut self, lr: f64, params: &mut [f32], gradient: &mut [f32], gradient_norm: f64) {
         self.updates += 1;
-        let isa = self.isa;
+        let (isa, time) = (self.isa, &self.time);
         if let Some(limit) = self.clip_norm.filter(|limit| gradient_norm > *limit) {
             let factor = (limit / gradient_norm) as f32;
-            gradient.par_chunks_mut(CHUNK).for_each(|chunk| scale(isa, chunk, factor));
+            gradient.par_chunks_mut(CHUNK).for_each(|chunk| time.time(|| scale(isa, chunk, factor)));
         }
         let (pieces, pieces_of_chunk) = (&self.pieces, &self.pieces_of_chunk);
         let pieces = |chunk: usize| &pieces[pieces_of_chunk[chunk].clone()];
@@ -195,24 +213,28 @@ impl Optimizer {
                 };
                 let plain = AdamStep { l2: 0.0, decoupled_decay: 0.0, ..decaying };
                 chunks.zip(self.second.par_chunks_mut(CHUNK)).enumerate().for_each(|(chunk, (((p, g), m), v))| {
-                    for Piece { range, decays } in pieces(chunk) {
-                        let (p, g) = (&mut p[range.clone()], &g[range.clone()]);
-                        let (m, v) = (&mut m[range.clone()], &mut v[range.clone()]);
-                        adam(isa, if *decays { &decaying } else { &plain }, p, g, m, v);
-                    }
+                    time.time(|| {
+                        for Piece { range, decays } in pieces(chunk) {
+                            let (p, g) = (&mut p[range.clone()], &g[range.clone()]);
+                            let (m, v) = (&mut m[range.clone()], &mut v[range.clone()]);
+                            adam(isa, if *decays { &decaying } else { &plain }, p, g, m, v);
+                        }
+                    })
                 });
             }
             OptimizerSpec::Sgd { momentum, l2, decoupled_weight_decay, .. } => {
                 chunks.enumerate().for_each(|(chunk, ((p, g), velocity))| {
-                    for Piece { range, decays } in pieces(chunk) {
-                        let (p, g) = (&mut p[range.clone()], &g[range.clone()]);
-                        let velocity = &mut velocity[range.clone()];
-                        let (l2, shrink) = if *decays { (l2, lr * decoupled_weight_decay) } else { (0.0, 0.0) };
-                        if shrink > 0.0 {
-                            scale(isa, p, (1.0 - shrink) as f32);
+                    time.time(|| {
+                        for Piece { range, decays } in pieces(chunk) {
+                            let (p, g) = (&mut p[range.clone()], &g[range.clone()]);
+                            let velocity = &mut velocity[range.clone()];
+                            let (l2, shrink) = if *decays { (l2, lr * decoupled_weight_decay) } else { (0.0, 0.0) };
+                            if shrink > 0.0 {
+                                scale(isa, p, (1.0 - shrink) as f32);
+                            }
+                            sgd_momentum(isa, lr as f32, momentum as f32, l2 as f32, p, g, velocity);
                         }
-                        sgd_momentum(isa, lr as f32, momentum as f32, l2 as f32, p, g, velocity);
-                    }
+                    })
                 });
             }
         }

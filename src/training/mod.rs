@@ -16,6 +16,7 @@
 mod checkpoint;
 mod data;
 mod history;
+mod profile;
 mod run_folder;
 mod session;
 mod transfer;
@@ -25,6 +26,7 @@ pub use crate::loss::Loss;
 pub use checkpoint::{Progress, State};
 pub use data::Data;
 pub use history::{EpochRecord, read_history, write_history};
+pub use profile::ProfileReport;
 pub use run_folder::{RunFolder, RunInfo};
 pub use session::{Observer, TrainRequest, TrainResult, resume, train};
 pub use transfer::TransferRequest;

@@ -10,6 +10,7 @@ use steersman_kernels::Isa;
 use super::checkpoint::{Progress, State};
 use super::data::Data;
 use super::history::{EpochRecord, write_history};
+use super::profile::{Profile, ProfileReport};
 use super::run_folder::{RunFolder, RunInfo};
 use super::transfer::{Start, TransferRequest};
 use super::validation::{Validation, ValidationResult};
@@ -21,6 +22,7 @@ use crate::model_file::{Model, TrainingRecord, weights_hash};
 use crate::network::{Network, StepInput, TrainingPlan};
 use crate::optimizer::Optimizer;
 use crate::recipe::{Keep, Recipe};
+use crate::stopwatch::Stopwatch;
 
 /// Most images of one row: three cameras, each mirrored. A batch of whole rows has at least one row.
 const IMAGES_OF_A_ROW: usize = 6;
@@ -50,6 +52,10 @@ pub trait Observer {
     fn progress(&mut self, epoch: u32, images: usize, of: usize, loss: f64);
     /// An epoch is done, of how many.
     fn epoch(&mut self, record: &EpochRecord, of: u32);
+    /// Whether the result is to say where the time went.
+    fn wants_profile(&self) -> bool {
+        false
+    }
 }
 
 /// What a run came to; `train --json` prints it.
@@ -87,6 +93,9 @@ pub struct TrainResult {
     /// Held-out tracks that were trained on all the same, here or by the model that training began from.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub trained_on_held_out: Vec<String>,
+    /// Where the time went, if the observer wants to know.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub profile: Option<ProfileReport>,
 }
 
 /// Trains anew. Call it inside a rayon pool; `stop` ends it after the current batch.
@@ -97,6 +106,7 @@ pub struct TrainResult {
 /// a run that diverges, [`Error::Interrupted`] after saving if `stop` is set.
 pub fn train(request: TrainRequest, observer: &mut dyn Observer, stop: &AtomicBool) -> Result<TrainResult> {
     let started = Instant::now();
+    let profile = observer.wants_profile().then(Profile::start);
     let TrainRequest { recordings, recipe, out, seed, cache_mib, from } = request;
     let start = from.as_ref().map(|from| Start::load(&from.model, from, &recipe, seed)).transpose()?;
     let data = Data::prepare(&recordings, &recipe, seed, cache_mib)?;
@@ -125,7 +135,8 @@ pub fn train(request: TrainRequest, observer: &mut dyn Observer, stop: &AtomicBo
     }
     data.write_split(&folder.file("split.csv"))?;
     folder.write_json("run.json", &info)?;
-    Session::new(folder, info, recipe, data, start, started)?.run(observer, stop)
+    let session = Session::new(folder, info, recipe, data, start, started)?;
+    session.measured(profile).run(observer, stop)
 }
 
 /// Goes on with the run in `path`, as if it had never stopped; prints the result again if it is finished.
@@ -135,6 +146,7 @@ pub fn train(request: TrainRequest, observer: &mut dyn Observer, stop: &AtomicBo
 /// As [`train`]; [`Error::Data`] also for damaged run folders and recordings that have changed.
 pub fn resume(path: &Path, observer: &mut dyn Observer, stop: &AtomicBool) -> Result<TrainResult> {
     let started = Instant::now();
+    let profile = observer.wants_profile().then(Profile::start);
     let folder = RunFolder::open(path)?;
     if let Some(result) = folder.result()? {
         observer.notice("this run is finished; here is its result again");
@@ -159,7 +171,7 @@ pub fn resume(path: &Path, observer: &mut dyn Observer, stop: &AtomicBool) -> Re
     let start = from.map(|from| Start::load(&folder.from(), &from, &recipe, info.seed)).transpose()?;
     let mut session = Session::new(folder, info, recipe, data, start, started)?;
     session.restore()?;
-    session.run(observer, stop)
+    session.measured(profile).run(observer, stop)
 }
 
 struct Session {
@@ -175,6 +187,7 @@ struct Session {
     notices: Vec<String>,
     state: State,
     started: Instant,
+    profile: Option<Profile>,
 }
 
 impl Session {
@@ -220,7 +233,21 @@ impl Session {
             leak_percent,
             notices,
             started,
+            profile: None,
         })
+    }
+
+    /// The session, with `profile` measuring what it does from now on.
+    fn measured(mut self, profile: Option<Profile>) -> Session {
+        if let Some(profile) = &profile {
+            self.training.measure(&profile.loading);
+            self.plan.measure(profile.update.clone());
+            self.state.optimizer.measure(profile.update.clone());
+            if let Some(validation) = &mut self.validation {
+                validation.measure(&profile.loading, profile.evaluation.clone());
+            }
+        }
+        Session { profile, ..self }
     }
 
     /// Takes the state over from the last checkpoint, if there is one.
@@ -279,9 +306,11 @@ impl Session {
         let started = Instant::now();
         self.training.begin_epoch(epoch);
         let batches = self.training.batches();
+        let waiting = self.profile.as_ref().map_or_else(Stopwatch::default, |profile| profile.waiting.clone());
         let updates_in_all = batches as u64 * u64::from(self.recipe.epochs);
         if self.state.progress.next_batch < batches {
-            self.training.fill(self.state.progress.next_batch, current)?;
+            let (training, batch) = (&self.training, self.state.progress.next_batch);
+            waiting.time(|| training.fill(batch, current))?;
         }
         while self.state.progress.next_batch < batches {
             let batch = self.state.progress.next_batch;
@@ -290,17 +319,18 @@ impl Session {
             let State { parameters, optimizer, progress, .. } = &mut self.state;
             let (network, plan, loss) = (&self.network, &mut self.plan, &self.recipe.loss);
             // While the network learns from one batch, the next one is prepared.
-            let (mean_loss, filled) = rayon::join(
+            let ((mean_loss, step_done), filled) = rayon::join(
                 || {
                     if current.n == 0 {
-                        return 0.0;
+                        return (0.0, Instant::now());
                     }
                     let input = StepInput { x: &current.x, labels: &current.labels, seed: self.info.seed, step };
-                    plan.step(network, parameters, loss, input)
+                    (plan.step(network, parameters, loss, input), Instant::now())
                 },
                 || if following < batches { training.fill(following, next) } else { Ok(()) },
             );
             filled?;
+            waiting.add(step_done.elapsed());
             if current.n > 0 {
                 let norm = plan.gradient_norm();
                 if !(mean_loss.is_finite() && norm.is_finite()) {
@@ -463,8 +493,11 @@ impl Session {
             weights_hash: weights_hash(&self.network, &self.state.parameters),
             leak_percent: self.leak_percent,
             trained_on_held_out: self.info.trained_on_held_out.clone(),
+            profile: None,
         };
         self.save_with_last(epoch_of_weights)?;
+        let profile = self.profile.as_ref().map(|profile| profile.report(&self.network, &self.plan));
+        let result = TrainResult { profile, ..result };
         self.folder.write_json("result.json", &result)?;
         Ok(result)
     }

@@ -2,9 +2,10 @@
 
 use crate::dataset::Camera;
 use crate::dataset::leak::NearTwins;
-use crate::dataset::loader::{Batch, Loader};
+use crate::dataset::loader::{Batch, Loader, LoaderTimes};
 use crate::error::Result;
 use crate::network::{InferencePlan, Network, Parameters};
+use crate::stopwatch::Stopwatch;
 
 /// How the network does on the validation side.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -39,6 +40,12 @@ impl Validation {
             loader,
             full_lock_deg,
         }
+    }
+
+    /// Adds the time that is spent from now on to `loading` and `evaluation`.
+    pub fn measure(&mut self, loading: &LoaderTimes, evaluation: Stopwatch) {
+        self.loader.measure(loading);
+        self.plan.measure(evaluation);
     }
 
     /// Number of images, each mirrored one counted too.

@@ -28,6 +28,14 @@ pub(crate) fn get<S: Simd>(simd: S, from: &[f32], at: usize) -> S::V {
     unsafe { simd.load(from.as_ptr()) }
 }
 
+/// The elements from `at` on, at most `LANES`, and 0 in the lanes after the last.
+#[inline(always)]
+pub(crate) fn get_first<S: Simd>(simd: S, from: &[f32], at: usize, count: usize) -> S::V {
+    let from = &from[at..at + count.min(S::LANES)];
+    // SAFETY: the slice has as many elements as are read.
+    unsafe { simd.load_first(from.as_ptr(), from.len()) }
+}
+
 /// Writes the `LANES` elements from `at` on.
 #[inline(always)]
 pub(crate) fn put<S: Simd>(simd: S, to: &mut [f32], at: usize, v: S::V) {

@@ -1,0 +1,73 @@
+//! How long threads work on a part of the work, summed over all of them.
+//!
+//! What counts is the CPU time of the thread, so that neither other programs nor a slow disk make a part look large; where the
+//! system does not tell it, the time on the clock.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{Duration, Instant};
+
+use cpu_time::ThreadTime;
+
+/// Adds up the time of what it is given to run. One that is off, the default, only runs it. Clones share the sum.
+#[derive(Clone, Debug, Default)]
+pub struct Stopwatch(Option<Arc<AtomicU64>>);
+
+impl Stopwatch {
+    /// One that measures, from 0.
+    pub fn on() -> Stopwatch {
+        Stopwatch(Some(Arc::default()))
+    }
+
+    /// Runs `work`. It should not wait for other threads: while it waits, rayon lets it do their work.
+    #[inline]
+    pub fn time<T>(&self, work: impl FnOnce() -> T) -> T {
+        if self.0.is_none() {
+            return work();
+        }
+        let (clock, cpu) = (Instant::now(), ThreadTime::try_now());
+        let result = work();
+        self.add(cpu.map_or_else(|_| clock.elapsed(), |cpu| cpu.elapsed()));
+        result
+    }
+
+    /// Adds time that was measured otherwise.
+    pub fn add(&self, time: Duration) {
+        if let Some(nanoseconds) = &self.0 {
+            nanoseconds.fetch_add(time.as_nanos() as u64, Ordering::Relaxed);
+        }
+    }
+
+    /// The sum so far, in seconds.
+    pub fn seconds(&self) -> f64 {
+        self.0.as_ref().map_or(0.0, |nanoseconds| nanoseconds.load(Ordering::Relaxed) as f64 * 1e-9)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn clones_share_the_sum_and_one_that_is_off_stays_at_0() {
+        let (on, off) = (Stopwatch::on(), Stopwatch::default());
+        let mut numbers = vec![1u64; 1000];
+        let mut work = || {
+            let started = Instant::now();
+            while started.elapsed() < Duration::from_millis(5) {
+                numbers.iter_mut().for_each(|x| *x = x.wrapping_mul(6_364_136_223_846_793_005) + 1);
+            }
+            numbers[0]
+        };
+        for watch in [&on, &on.clone(), &off] {
+            assert_ne!(watch.time(&mut work), 1);
+        }
+        let worked = on.seconds();
+        // Of 10 ms on the clock other programs may have taken a part.
+        assert!(worked > 0.0 && worked < 10.0, "{worked}");
+        on.clone().add(Duration::from_secs(1));
+        off.add(Duration::from_secs(1));
+        assert!((on.seconds() - worked - 1.0).abs() < 1e-6, "{}", on.seconds());
+        assert_eq!(off.seconds(), 0.0);
+    }
+}
