@@ -71,6 +71,16 @@ impl<'a> ClosedLoop<'a> {
         self.controls
     }
 
+    /// The moment of the last answer.
+    pub fn last_moment(&self) -> Option<&Moment> {
+        self.run.moments.last()
+    }
+
+    /// Times the car was put back so far.
+    pub fn interventions(&self) -> usize {
+        self.run.interventions
+    }
+
     /// Share of the way that is made, 0 to 1.
     pub fn share(&self) -> f64 {
         (self.simulation.progress_m / self.way_m).clamp(0.0, 1.0)

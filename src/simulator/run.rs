@@ -1,10 +1,13 @@
 //! One closed-loop run: a driver steers by what the camera shows, free or assisted.
 
+use std::time::Instant;
+
 use super::camera::RgbFrame;
 use super::car::STEP_S;
 use super::closed_loop::ClosedLoop;
 use super::expert;
 use super::eye::Eye;
+use super::observer::{DriveFrame, DriveObserver};
 use super::simulation::Simulation;
 use super::speed::{Speed, SpeedController, telemetry_mph};
 use super::statistics::quantile;
@@ -167,22 +170,64 @@ pub struct RunOptions {
 /// # Errors
 /// If a picture cannot be encoded.
 pub fn run(track: &Track, driver: &mut dyn Driver, options: &RunOptions, seed: u64) -> Result<Run> {
+    drive_run(track, driver, options, seed, None)
+}
+
+/// As [`run`], to the same bits, telling `observer` every frame. Pictures are taken even if the driver does not look.
+///
+/// # Errors
+/// If a picture cannot be encoded, or the observer's own.
+pub fn run_observed(
+    track: &Track,
+    driver: &mut dyn Driver,
+    options: &RunOptions,
+    seed: u64,
+    observer: &mut dyn DriveObserver,
+) -> Result<Run> {
+    drive_run(track, driver, options, seed, Some(observer))
+}
+
+fn drive_run(
+    track: &Track,
+    driver: &mut dyn Driver,
+    options: &RunOptions,
+    seed: u64,
+    mut observer: Option<&mut dyn DriveObserver>,
+) -> Result<Run> {
     let mut closed_loop = ClosedLoop::new(track, options, seed);
-    let mut eye = driver.needs_frame().then(|| Eye::new(track, seed));
+    let mut eye = (driver.needs_frame() || observer.is_some()).then(|| Eye::new(track, seed));
     let blank = RgbFrame::default();
     let mut controller = SpeedController::default();
     while closed_loop.goes_on() {
         if closed_loop.frame_is_due() {
             let simulation = closed_loop.simulation();
             let speed_mph = telemetry_mph(simulation.car.speed_mps);
-            let frame = match &mut eye {
+            let picture = match &mut eye {
                 Some(eye) => eye.look(simulation)?,
                 None => &blank,
             };
-            let steering = driver.steer(frame, &DriveState { simulation, speed_mph });
+            let asked = Instant::now();
+            let steering = driver.steer(picture, &DriveState { simulation, speed_mph });
+            let answered_in = asked.elapsed();
             let target_mph = options.speed.target_mph(simulation);
             let throttle = controller.throttle_at(simulation.time_s(), target_mph, speed_mph);
             closed_loop.answer(steering, throttle);
+            if let (Some(observer), Some(moment)) = (&mut observer, closed_loop.last_moment()) {
+                let simulation = closed_loop.simulation();
+                observer.frame(&DriveFrame {
+                    picture,
+                    simulation,
+                    options,
+                    steering: moment.steering,
+                    expert_steering: expert::pursuit(simulation),
+                    throttle: moment.throttle,
+                    speed_mph,
+                    target_mph,
+                    put_back: moment.intervention,
+                    interventions: closed_loop.interventions(),
+                    answered_in,
+                })?;
+            }
         }
         closed_loop.step();
     }
@@ -249,5 +294,32 @@ mod tests {
         let plain = spread(options(false));
         assert!(spread(RunOptions { latency_ms: 700.0, ..options(false) }) > 1.1 * plain);
         assert!(spread(RunOptions { noise: 0.1, ..options(false) }) > 1.1 * plain);
+    }
+
+    #[test]
+    fn an_observer_sees_every_frame_and_changes_nothing() {
+        struct Watching(Vec<(f64, f64, bool)>, usize);
+        impl DriveObserver for Watching {
+            fn frame(&mut self, frame: &DriveFrame) -> Result<()> {
+                assert!(frame.picture.pixels.iter().any(|p| *p > 0));
+                assert_eq!((frame.lap(), frame.expert_steering), (1, expert::pursuit(frame.simulation)));
+                self.0.push((frame.simulation.time_s(), frame.steering, frame.put_back));
+                self.1 = frame.interventions;
+                if self.0.len() == 300 { Err(crate::Error::Interrupted) } else { Ok(()) }
+            }
+        }
+        let track = Track::load("lake").unwrap();
+        let mut watching = Watching(Vec::new(), 0);
+        let stopped = run_observed(&track, &mut Zero, &options(true), 2, &mut watching);
+        assert!(matches!(stopped, Err(crate::Error::Interrupted)));
+        let unseen = run(&track, &mut Zero, &options(true), 2).unwrap();
+        let seen: Vec<_> = unseen.moments[..300].iter().map(|m| (m.time_s, m.steering, m.intervention)).collect();
+        assert_eq!(watching.0, seen);
+        assert!(watching.1 > 0 && watching.1 == seen.iter().filter(|m| m.2).count());
+
+        let mut watching = Watching(Vec::new(), 0);
+        let free = run_observed(&track, &mut Zero, &options(false), 2, &mut watching).unwrap();
+        assert_eq!(free, run(&track, &mut Zero, &options(false), 2).unwrap());
+        assert_eq!(watching.0.len(), free.moments.len());
     }
 }
