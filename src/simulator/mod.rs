@@ -32,6 +32,7 @@ pub mod speed;
 pub mod statistics;
 mod terrain;
 pub mod track;
+pub mod trajectory;
 mod world;
 
 pub use camera::{BodyPose, Camera, HEIGHT, Mount, RgbFrame, WIDTH};
