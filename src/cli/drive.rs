@@ -175,7 +175,7 @@ impl Wheel {
         let names = Names {
             title: format!("{}, seed {}", track.name(), args.seed),
             subtitle: args.model.clone(),
-            model: if matches!(self, Wheel::Model(_)) { "model" } else { "driver" },
+            model: Some(if matches!(self, Wheel::Model(_)) { "model" } else { "driver" }),
             reference: "expert",
         };
         DriveVideo::create(path, track, names, args.fps, onlooker)

@@ -54,6 +54,12 @@ pub fn run(args: VideoArgs) -> Result<()> {
         None => None,
     };
     let is_drive = replay::is_drive(&args.source);
+    let below = if is_drive { Vec::new() } else { replay::drives_below(&args.source) };
+    if !below.is_empty() {
+        let names: Vec<String> = below.iter().map(|path| path.display().to_string()).collect();
+        let message = format!("holds several drives; name one of {}", names.join(", "));
+        return Err(Error::Usage(format!("{} {message}", args.source.display())));
+    }
     if !is_drive && (args.seed.is_some() || args.assisted) {
         let message = "is no folder of `drive --out`, so there is no run to choose; leave out --seed and --assisted";
         return Err(Error::Usage(format!("{} {message}", args.source.display())));

@@ -80,7 +80,7 @@ impl DriveObserver for Filming<'_> {
         scene.speed_mph = Some(frame.speed_mph);
         scene.cte_m = Some(simulation.cte_m());
         scene.answered_in = Some(frame.answered_in);
-        scene.lap = Some((frame.lap(), frame.options.laps));
+        scene.lap = Some((frame.lap(), Some(frame.options.laps)));
         scene.place = Some([simulation.car.x, simulation.car.y]);
         scene.put_back = frame.put_back;
         video.show(scene)?;

@@ -1,11 +1,11 @@
-//! Pictures as H.264 (Constrained Baseline, 4:2:0) in an MP4 file: what browsers, VLC and telephones play.
+//! Pictures as H.264 (Main profile, 4:2:0) in an MP4 file: what browsers, VLC and telephones play.
 
 use std::fs::File;
 use std::io::BufWriter;
 use std::path::Path;
 
 use mp4::{AvcConfig, MediaConfig, Mp4Config, Mp4Sample, Mp4Writer, TrackConfig, TrackType};
-use rusty_h264_common::YuvPlanes;
+use rusty_h264_common::{Profile, YuvPlanes};
 use rusty_h264_encoder::{Encoder, EncoderConfig, Preset};
 
 use super::VideoSummary;
@@ -17,8 +17,8 @@ use crate::error::{Error, Result};
 const TICKS_PER_S: u32 = 90_000;
 /// Seconds between pictures that stand alone, to which a player can jump.
 const KEY_S: f64 = 2.0;
-/// Quantizer, 0 (best) to 51: text stays crisp, and a lap has a few MB.
-const QUANTIZER: u8 = 27;
+/// Quantizer, 0 (best) to 51: text stays crisp, and two minutes of the simulator take about 15 MB.
+const QUANTIZER: u8 = 29;
 /// H.264 level 3.1: up to 1280x720 pixels 30 times a second.
 const LEVEL_IDC: u8 = 31;
 /// Rates that can be written.
@@ -46,8 +46,12 @@ impl VideoFile {
         check_name(path)?;
         check_fps(fps)?;
         let [height, width] = size;
+        // Each picture comes out as it goes in: no reordering, no window of pictures to come.
         let mut config = EncoderConfig::baseline(width, height);
         config.preset = Preset::Fast;
+        // Arithmetic coding saves about a fifth, and every player of today knows it.
+        config.profile = Profile::Main;
+        config.cabac = true;
         config.qp = QUANTIZER;
         config.level_idc = LEVEL_IDC;
         config.framerate = fps as f32;
@@ -315,7 +319,7 @@ mod tests {
         let track = &reader.tracks()[&1];
         assert_eq!((track.width(), track.height(), track.sample_count()), (128, 96, 45));
         assert_eq!(track.media_type().unwrap(), mp4::MediaType::H264);
-        assert_eq!(track.video_profile().unwrap(), mp4::AvcProfile::AvcConstrainedBaseline);
+        assert_eq!(track.video_profile().unwrap(), mp4::AvcProfile::AvcMain);
         let samples: Vec<Mp4Sample> = (1..=45).map(|id| reader.read_sample(1, id).unwrap().unwrap()).collect();
         assert!(samples.iter().enumerate().all(|(k, s)| s.start_time == 9000 * k as u64 && s.duration == 9000));
         let keys: Vec<usize> = (0..45).filter(|k| samples[*k].is_sync).collect();

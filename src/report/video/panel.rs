@@ -24,6 +24,8 @@ const MAP: [f64; 4] = [660.0, 66.0, 940.0, 300.0];
 /// Steering of the last seconds: top and bottom with a map, and without.
 const TRACE: [f64; 2] = [386.0, 456.0];
 const LONE_TRACE: [f64; 2] = [110.0, 430.0];
+/// Ranges of its scale, degrees to either side.
+const TRACE_RANGES_DEG: [f64; 3] = [5.0, 10.0, MAX_STEER_DEG];
 /// Seconds of steering that are shown.
 const TRACE_S: f64 = 10.0;
 /// The steering wheel: centre (x, y) and radius.
@@ -57,8 +59,8 @@ pub struct Scene {
     pub cte_m: Option<f64>,
     /// How long the model took to answer.
     pub answered_in: Option<Duration>,
-    /// Lap, from 1, and laps in all.
-    pub lap: Option<(usize, usize)>,
+    /// Lap, from 1, and laps in all if that is known.
+    pub lap: Option<(usize, Option<usize>)>,
     /// Where the car is (x, y), m.
     pub place: Option<[f64; 2]>,
     /// Whether the car was just put somewhere else, so that its way has a gap.
@@ -72,8 +74,8 @@ pub struct Names {
     pub title: String,
     /// What else to know, in one line.
     pub subtitle: String,
-    /// Who steers, or would steer, in the colour of models; 6 letters fit.
-    pub model: &'static str,
+    /// Who steers, or would steer, in the colour of models, if anybody; 6 letters fit.
+    pub model: Option<&'static str>,
     /// Whose steering it is compared with; 6 letters fit.
     pub reference: &'static str,
 }
@@ -162,10 +164,11 @@ impl Panel {
 
     /// What stands around the numbers and curves.
     fn draw_scales(&mut self) {
-        let [top, bottom] = self.trace_edges();
+        let [_, bottom] = self.trace_edges();
         let base = &mut self.base;
         let middle = f64::midpoint(BAR[0], BAR[1]);
-        for (row, name, colour) in [(0, self.names.model, MODEL), (1, self.names.reference, HUMAN)] {
+        for (row, name, colour) in [(0, self.names.model, MODEL), (1, Some(self.names.reference), HUMAN)] {
+            let Some(name) = name else { continue };
             let top = 330 + 36 * row;
             base.draw_text([164, top + 2], Size::Medium, true, INK, name);
             fill(base, [164.0, top as f64 + 24.0, 226.0, top as f64 + 27.0], colour);
@@ -180,13 +183,7 @@ impl Panel {
         }
         base.draw_text([BAR[0] as usize - 40, 398], Size::Small, false, QUIET_INK, "left");
         base.draw_text([BAR[1] as usize, 398], Size::Small, false, QUIET_INK, "right");
-        let [left, right] = ASIDE.map(|x| x as f64);
-        for deg in [-MAX_STEER_DEG, 0.0, MAX_STEER_DEG] {
-            let y = trace_y(deg, [top, bottom]);
-            base.draw_line([left, y], [right, y], 1.0, if deg == 0.0 { [0xa0; 3] } else { GRID });
-        }
         base.draw_text([ASIDE[0], bottom as usize + 4], Size::Small, false, QUIET_INK, "steering, last 10 s");
-        base.draw_text_right([ASIDE[1], bottom as usize + 4], Size::Small, false, QUIET_INK, "±25°");
     }
 
     fn trace_edges(&self) -> [f64; 2] {
@@ -242,10 +239,9 @@ impl Panel {
     fn paint_angles(&self, scene: &Scene, out: &mut RgbImage) {
         let middle = f64::midpoint(BAR[0], BAR[1]);
         for (row, deg, colour) in [(0, scene.model_deg, MODEL), (1, scene.reference_deg, HUMAN)] {
-            let top = 330 + 36 * row;
-            let text = deg.map_or("-".into(), |deg| format!("{deg:+.1}°"));
-            out.draw_text_right([632, top + 1], Size::Large, true, INK, &text);
             let Some(deg) = deg else { continue };
+            let top = 330 + 36 * row;
+            out.draw_text_right([632, top + 1], Size::Large, true, INK, &(signed(deg, 1) + "°"));
             let end = middle + (deg / MAX_STEER_DEG).clamp(-1.0, 1.0) * (BAR[1] - BAR[0]) / 2.0;
             let (left, right) = (middle.min(end), middle.max(end));
             fill(out, [left - 1.0, top as f64 + 5.0, right + 1.0, top as f64 + 23.0], colour);
@@ -253,42 +249,55 @@ impl Panel {
     }
 
     fn paint_figures(&self, scene: &Scene, out: &mut RgbImage) {
-        let known = |text: Option<String>| text.unwrap_or("-".into());
         let minutes = (scene.time_s / 60.0).floor();
         let apart = scene.model_deg.zip(scene.reference_deg).map(|(a, b)| format!("{:.1}°", (a - b).abs()));
+        let beside = match self.projection {
+            Some(_) => ("from line", scene.cte_m.map(|m| signed(m, 2) + " m")),
+            None => ("apart", apart),
+        };
+        let lap = scene.lap.map(|(lap, laps)| match laps {
+            Some(laps) => format!("{lap}/{laps}"),
+            None => lap.to_string(),
+        });
         let figures = [
-            ("speed", known(scene.speed_mph.map(|mph| format!("{mph:.1} mph")))),
-            match self.projection {
-                Some(_) => ("from line", known(scene.cte_m.map(|m| format!("{m:+.2} m")))),
-                None => ("apart", known(apart)),
-            },
-            ("answer in", known(scene.answered_in.map(|took| format!("{:.1} ms", 1000.0 * took.as_secs_f64())))),
-            match scene.lap {
-                Some((lap, laps)) => ("lap", format!("{lap}/{laps}")),
-                None => ("", String::new()),
-            },
-            ("time", format!("{minutes:.0}:{:04.1}", scene.time_s - 60.0 * minutes)),
+            ("speed", scene.speed_mph.map(|mph| format!("{mph:.1} mph"))),
+            beside,
+            ("answer in", scene.answered_in.map(|took| format!("{:.1} ms", 1000.0 * took.as_secs_f64()))),
+            ("lap", lap),
+            ("time", Some(format!("{minutes:.0}:{:04.1}", scene.time_s - 60.0 * minutes))),
         ];
+        // What is not known has no place; what is known keeps it.
         for ((caption, text), left) in figures.iter().zip([164, 272, 372, 472, 544]) {
-            out.draw_text([left, 426], Size::Medium, true, INK, text);
-            out.draw_text([left, 450], Size::Small, false, QUIET_INK, caption);
+            if let Some(text) = text {
+                out.draw_text([left, 426], Size::Medium, true, INK, text);
+                out.draw_text([left, 450], Size::Small, false, QUIET_INK, caption);
+            }
         }
     }
 
     fn paint_trace(&self, now_s: f64, out: &mut RgbImage) {
-        let edges = self.trace_edges();
+        let [top, bottom] = self.trace_edges();
         let [left, right] = ASIDE.map(|x| x as f64);
+        let angles = self.trace.iter().flat_map(|(_, model, reference)| [*model, *reference]).flatten();
+        let widest = angles.map(f64::abs).fold(0.0, f64::max);
+        let range_deg = TRACE_RANGES_DEG.into_iter().find(|range| widest <= *range).unwrap_or(MAX_STEER_DEG);
+        let y = |deg: f64| f64::midpoint(top, bottom) - (deg / range_deg).clamp(-1.0, 1.0) * (bottom - top) / 2.0;
+        for (deg, grey) in [(-range_deg, GRID), (0.0, [0xa0; 3]), (range_deg, GRID)] {
+            out.draw_line([left, y(deg)], [right, y(deg)], 1.0, grey);
+        }
+        let range = format!("±{range_deg:.0}°");
+        out.draw_text_right([ASIDE[1], bottom as usize + 4], Size::Small, false, QUIET_INK, &range);
         let x = |time_s: f64| right - (now_s - time_s) / TRACE_S * (right - left);
         type Moment = (f64, Option<f64>, Option<f64>);
         let mut curve = |of: fn(&Moment) -> Option<f64>, colour| {
             for (a, b) in self.trace.iter().zip(self.trace.iter().skip(1)) {
                 if let (Some(from), Some(to)) = (of(a), of(b)) {
-                    out.draw_line([x(a.0), trace_y(from, edges)], [x(b.0), trace_y(to, edges)], 2.0, colour);
+                    out.draw_line([x(a.0), y(from)], [x(b.0), y(to)], 2.0, colour);
                 }
             }
         };
-        curve(|moment| moment.2, HUMAN);
         curve(|moment| moment.1, MODEL);
+        curve(|moment| moment.2, HUMAN);
     }
 }
 
@@ -305,9 +314,10 @@ impl Camera {
     }
 }
 
-/// Where an angle, degrees, is in the curve of the last seconds: right is up.
-fn trace_y(deg: f64, [top, bottom]: [f64; 2]) -> f64 {
-    f64::midpoint(top, bottom) - (deg / MAX_STEER_DEG).clamp(-1.0, 1.0) * (bottom - top) / 2.0
+/// A number with its sign, which zero has not.
+fn signed(value: f64, decimals: usize) -> String {
+    let text = format!("{value:+.decimals$}");
+    if text.chars().any(|c| ('1'..='9').contains(&c)) { text } else { text[1..].into() }
 }
 
 /// Draws the road and what the colours of the way mean.
@@ -358,7 +368,7 @@ mod tests {
     use super::*;
 
     fn names() -> Names {
-        Names { title: "lake".into(), subtitle: "a model".into(), model: "model", reference: "expert" }
+        Names { title: "lake".into(), subtitle: "a model".into(), model: Some("model"), reference: "expert" }
     }
 
     /// Pixels of a part of the picture that have the colour.
@@ -417,6 +427,11 @@ mod tests {
         let second = count(&panel.base, map, far) - before;
         assert!(second > 20 && count(&panel.base, map, near) <= first);
         assert!(second < 3 * first, "no line leads from one stretch to the other: {second}");
+    }
+
+    #[test]
+    fn numbers_have_their_sign_and_zero_has_none() {
+        assert_eq!([1.25, -0.04, 0.0, -0.05].map(|v| signed(v, 1)), ["+1.2", "0.0", "0.0", "-0.1"]);
     }
 
     #[test]

@@ -33,7 +33,7 @@ pub fn film(
     let names = Names {
         title: name(path),
         subtitle: format!("recording, {} rows, {own:.3} Hz", recording.rows.len()).replace(".000", ""),
-        model: "model",
+        model: onlooker.as_ref().map(|_| "model"),
         reference: "human",
     };
     let mut video = Video::create(out, Panel::new(names, None), fps.unwrap_or(own.clamp(1.0, 60.0)))?;

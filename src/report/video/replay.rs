@@ -61,7 +61,7 @@ pub fn film(
     let names = Names {
         title: format!("{}, {kind}, seed {seed}", track.name()),
         subtitle: end_of(&folder.display().to_string(), 36),
-        model: if onlooker.is_some() { "model" } else { "driver" },
+        model: Some(if onlooker.is_some() { "model" } else { "driver" }),
         reference: "expert",
     };
     let panel = Panel::new(names, Some(&track));
@@ -79,6 +79,7 @@ pub fn film(
         scene.reference_deg = Some(expert::pursuit(&simulation) * MAX_STEER_DEG);
         scene.speed_mph = Some(waypoint.speed_mph);
         scene.cte_m = Some(waypoint.cte_m);
+        scene.lap = Some(((simulation.progress_m / track.length_m).max(0.0) as usize + 1, None));
         scene.place = Some([waypoint.x_m, waypoint.y_m]);
         scene.put_back = waypoint.intervention > 0;
         put_back += usize::from(scene.put_back);
@@ -94,6 +95,23 @@ pub fn film(
         (false, times) => format!("{:.1} s, put back {times} times", scene.time_s),
     };
     Ok((video.finish(&text)?, stopped))
+}
+
+/// Folders of drives in `folder` and below, as training runs keep them.
+pub fn drives_below(folder: &Path) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
+    let mut folders: Vec<PathBuf> = entries.filter(|path| path.is_dir()).collect();
+    folders.sort();
+    let found = |path: PathBuf| if is_drive(&path) { vec![path] } else { drives_in(&path) };
+    folders.into_iter().flat_map(found).collect()
+}
+
+/// Folders of drives directly in `folder`.
+fn drives_in(folder: &Path) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
+    let mut found: Vec<PathBuf> = entries.filter(|path| is_drive(path)).collect();
+    found.sort();
+    found
 }
 
 fn summary(folder: &Path) -> Result<DriveSummary> {
