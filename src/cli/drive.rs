@@ -13,6 +13,7 @@ use crate::dataset::held_out::trained_on_held_out;
 use crate::error::{Error, Result};
 use crate::new_folder::NewFolder;
 use crate::pilot::Pilot;
+use crate::report::map;
 use crate::report::video::Onlooker;
 use crate::report::video::drive::DriveVideo;
 use crate::report::video::panel::Names;
@@ -49,7 +50,7 @@ pub struct DriveArgs {
     /// A second model, `expert` or `zero`: drives the same seeds, and the difference is tested
     #[arg(long, value_name = "MODEL")]
     against: Option<String>,
-    /// Save the trajectories as csv files; the folder must not exist
+    /// Save the trajectories as csv files, and a map of them; the folder must not exist
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
     /// Save a video of the first run, driven without help: H.264 in an .mp4 file, which must not exist
@@ -107,7 +108,10 @@ pub fn run(args: DriveArgs) -> Result<()> {
     };
     let comparison = other.as_ref().map_or(Ok(Vec::new()), |other| compare(&result, other))?;
     // What was measured is told even if it cannot be saved.
-    let saved = folder.map_or(Ok(()), |folder| write_trajectories(&result, folder));
+    let saved = folder.map_or(Ok(()), |folder| {
+        map::write(&track, &result, &folder)?;
+        write_trajectories(&result, folder)
+    });
     let film = |video: DriveVideo| at_wheel.film(video, &track, &options, &args, &stop);
     if args.json {
         let against = other.as_ref().map(|other| &other.summary);

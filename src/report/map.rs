@@ -2,7 +2,10 @@
 
 use super::palette::{INK, QUIET_INK, heat_hex};
 use super::svg::{Anchor, Svg};
-use crate::simulator::Track;
+use crate::error::{Error, Result};
+use crate::new_folder::NewFolder;
+use crate::simulator::run::Moment;
+use crate::simulator::{DriveResult, DriveSummary, Track};
 
 /// Distance from the line that has the darkest colour, m.
 pub(super) const DARKEST_M: f64 = 2.0;
@@ -20,6 +23,26 @@ pub struct Place {
     pub cte_m: f64,
     /// Whether the car was just put back.
     pub put_back: bool,
+}
+
+/// Size of a map on its own, pixels.
+const PAGE: [f64; 2] = [760.0, 620.0];
+
+/// Writes the map of a drive on `track`, `map.svg`, into `folder`: its assisted runs, which are the free ones where nobody had to
+/// help.
+///
+/// # Errors
+///
+/// If it cannot be written.
+pub fn write(track: &Track, result: &DriveResult, folder: &NewFolder) -> Result<()> {
+    let place = |m: &Moment| Place { x: m.x, y: m.y, cte_m: m.cte_m, put_back: m.intervention };
+    let drives: Vec<Vec<Place>> =
+        result.runs.iter().map(|pair| pair.assisted.moments.iter().map(place).collect()).collect();
+    let DriveSummary { runs, interventions, .. } = result.summary;
+    let title = format!("{}: {runs} runs, put back {interventions} times", track.name());
+    let path = folder.unfinished().join("map.svg");
+    let written = std::fs::write(&path, draw(&title, Some(track), &drives, PAGE));
+    written.map_err(|source| folder.explain(Error::Io { path, source }))
 }
 
 /// Draws `drives` on `track`, if it is known, within `size` (width, height) pixels.

@@ -21,6 +21,8 @@ pub struct DriveVideo {
 /// Films while the run goes on.
 struct Filming<'a> {
     film: &'a mut DriveVideo,
+    /// Whether the driver looks at pictures, so that its time to answer means something.
+    looks: bool,
     progress: &'a mut dyn FnMut(f64) -> bool,
 }
 
@@ -58,7 +60,8 @@ impl DriveVideo {
         seed: u64,
         progress: &mut dyn FnMut(f64) -> bool,
     ) -> Result<(VideoSummary, bool)> {
-        match run_observed(track, driver, options, seed, &mut Filming { film: &mut self, progress }) {
+        let looks = driver.needs_frame();
+        match run_observed(track, driver, options, seed, &mut Filming { film: &mut self, looks, progress }) {
             Ok(run) => Ok((self.video.finish(&outcome(&run, options))?, false)),
             Err(Error::Interrupted) => Ok((self.video.finish("stopped")?, true)),
             Err(error) => Err(error),
@@ -79,7 +82,7 @@ impl DriveObserver for Filming<'_> {
         scene.reference_deg = Some(frame.expert_steering * MAX_STEER_DEG);
         scene.speed_mph = Some(frame.speed_mph);
         scene.cte_m = Some(simulation.cte_m());
-        scene.answered_in = Some(frame.answered_in);
+        scene.answered_in = self.looks.then_some(frame.answered_in);
         scene.lap = Some((frame.lap(), Some(frame.options.laps)));
         scene.place = Some([simulation.car.x, simulation.car.y]);
         scene.put_back = frame.put_back;
