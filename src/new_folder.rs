@@ -24,7 +24,7 @@ impl NewFolder {
     /// [`Error::Usage`] if there is something at `path`, or nothing can be created there.
     pub fn create(path: &Path) -> Result<NewFolder> {
         if fs::symlink_metadata(path).is_ok() {
-            return Err(exists(path));
+            return Err(exists(path, "folder"));
         }
         let parent = create_parent(path)?;
         let name = path.file_name().unwrap_or_default().to_string_lossy();
@@ -51,7 +51,7 @@ impl NewFolder {
     /// removed then.
     pub fn finish(self) -> Result<()> {
         if fs::symlink_metadata(&self.path).is_ok() {
-            return Err(exists(&self.path));
+            return Err(exists(&self.path, "folder"));
         }
         fs::rename(self.unfinished.path(), &self.path).map_err(Error::io(&self.path))?;
         // It has moved away; there is nothing left to remove.
@@ -79,14 +79,19 @@ impl NewFolder {
     pub fn explain(&self, error: Error) -> Error {
         let Error::Io { path, source } = error else { return error };
         let path = path.strip_prefix(self.unfinished()).map_or(path.clone(), |inside| self.path.join(inside));
-        let full = [ErrorKind::StorageFull, ErrorKind::QuotaExceeded, ErrorKind::FileTooLarge];
-        if full.contains(&source.kind()) {
-            let out = self.path.display();
-            let remedy = format!("nothing of {out} is kept; make room on that disk, or name a folder on another");
-            return Error::Usage(format!("{}: {source}; {remedy}", path.display()));
-        }
-        Error::Io { path, source }
+        explain_full_disk(&path, &self.path, source, "folder")
     }
+}
+
+/// The error `source` at `path`, which was to be in the new file or folder `out`: where the disk is full, with a remedy.
+pub(crate) fn explain_full_disk(path: &Path, out: &Path, source: io::Error, kind: &str) -> Error {
+    let full = [ErrorKind::StorageFull, ErrorKind::QuotaExceeded, ErrorKind::FileTooLarge];
+    if full.contains(&source.kind()) {
+        let remedy =
+            format!("nothing of {} is kept; make room on that disk, or name a {kind} on another", out.display());
+        return Error::Usage(format!("{}: {source}; {remedy}", path.display()));
+    }
+    Error::io(path)(source)
 }
 
 /// Creates the folder `path` at once, for what is to be seen while it grows; missing parents are created.
@@ -97,13 +102,13 @@ impl NewFolder {
 pub fn create_now(path: &Path) -> Result<()> {
     create_parent(path)?;
     fs::create_dir(path).map_err(|source| match source.kind() {
-        ErrorKind::AlreadyExists => exists(path),
+        ErrorKind::AlreadyExists => exists(path, "folder"),
         _ => denied(path, &source),
     })
 }
 
 /// Creates what is missing above `path` and returns the folder it will be in.
-fn create_parent(path: &Path) -> Result<&Path> {
+pub(crate) fn create_parent(path: &Path) -> Result<&Path> {
     let parent = match path.parent() {
         Some(parent) if !parent.as_os_str().is_empty() => parent,
         _ => Path::new("."),
@@ -112,13 +117,14 @@ fn create_parent(path: &Path) -> Result<&Path> {
     Ok(parent)
 }
 
-fn denied(path: &Path, source: &io::Error) -> Error {
+pub(crate) fn denied(path: &Path, source: &io::Error) -> Error {
     let message = format!("cannot be created: {source}; name a folder where you may write");
     Error::Usage(format!("{}: {message}", path.display()))
 }
 
-fn exists(path: &Path) -> Error {
-    let remedy = "exists already and is not overwritten; name a new folder or remove it";
+/// The error of a `kind` ("file" or "folder") that would have to replace something.
+pub(crate) fn exists(path: &Path, kind: &str) -> Error {
+    let remedy = format!("exists already and is not overwritten; name a new {kind} or remove it");
     Error::Usage(format!("{}: {remedy}", path.display()))
 }
 

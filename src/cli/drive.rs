@@ -7,13 +7,18 @@ use clap::Args;
 use serde::Serialize;
 
 use super::share_bar::ShareBar;
+use super::video::tell_video;
 use super::{pool, print_json, stop_on_ctrl_c};
 use crate::dataset::held_out::trained_on_held_out;
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::live::messages::Hello;
 use crate::live::{DEFAULT_PORT, Live, Watch};
 use crate::new_folder::NewFolder;
 use crate::pilot::Pilot;
+use crate::report::map;
+use crate::report::video::Onlooker;
+use crate::report::video::drive::DriveVideo;
+use crate::report::video::panel::Names;
 use crate::simulator::drive::write_trajectories;
 use crate::simulator::statistics::PairedTest;
 use crate::simulator::{
@@ -49,7 +54,7 @@ pub struct DriveArgs {
     /// A second model, `expert` or `zero`: drives the same seeds, and the difference is tested
     #[arg(long, value_name = "MODEL")]
     against: Option<String>,
-    /// Save the trajectories as csv files; the folder must not exist
+    /// Save the trajectories as csv files, and a map of them; the folder must not exist
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
     /// Show the runs, one after the other and in real time, on a page in a browser of this machine
@@ -58,6 +63,15 @@ pub struct DriveArgs {
     /// Port of the page; 0 takes any free one
     #[arg(long, default_value_t = DEFAULT_PORT, requires = "watch")]
     port: u16,
+    /// Save a video of the first run, driven without help: H.264 in an .mp4 file, which must not exist
+    #[arg(long, value_name = "FILE")]
+    video: Option<PathBuf>,
+    /// Colour in the video what excites the model
+    #[arg(long, requires = "video")]
+    saliency: bool,
+    /// Pictures a second of the video [default: 20, as the driver sees them]
+    #[arg(long, value_name = "N", requires = "video")]
+    fps: Option<f64>,
     /// Threads; 0 is one for each core
     #[arg(long, default_value_t = 0)]
     threads: usize,
@@ -96,6 +110,7 @@ pub fn run(args: DriveArgs) -> Result<()> {
     let then = args.against.as_ref().map_or(String::new(), |name| format!(", then {name}"));
     let hello = || Hello::new("watch", format!("at the wheel: {}{then}", args.model), &track);
     let live = args.watch.then(|| Live::start(args.port, hello(), false)).transpose()?;
+    let video = args.video.as_deref().map(|path| at_wheel.video(path, &track, &args)).transpose()?;
     let stop = stop_on_ctrl_c()?;
     if let Some(live) = &live {
         eprintln!("open {} to watch", live.url());
@@ -116,11 +131,17 @@ pub fn run(args: DriveArgs) -> Result<()> {
     }
     let comparison = other.as_ref().map_or(Ok(Vec::new()), |other| compare(&result, other))?;
     // What was measured is told even if it cannot be saved.
-    let saved = folder.map_or(Ok(()), |folder| write_trajectories(&result, folder));
+    let saved = folder.map_or(Ok(()), |folder| {
+        map::write(&track, &result, &folder)?;
+        write_trajectories(&result, folder)
+    });
+    let film = |video: DriveVideo| at_wheel.film(video, &track, &options, &args, &stop);
     if args.json {
         let against = other.as_ref().map(|other| &other.summary);
+        // The JSON is the last line, so the video comes first; what it ends with must not hide what was measured.
+        let filmed = video.map_or(Ok(()), film);
         print_json(&Report { summary: &result.summary, against, comparison })?;
-        return saved;
+        return saved.and(filmed);
     }
     print_summary(&args.model, &result.summary);
     if let (Some(other), Some(name)) = (&other, &args.against) {
@@ -133,7 +154,7 @@ pub fn run(args: DriveArgs) -> Result<()> {
             println!("{measure:<45} A {mean_a:>8.3}  B {mean_b:>8.3}  p {p_value:.4}  {verdict}");
         }
     }
-    saved
+    saved.and(video.map_or(Ok(()), film))
 }
 
 /// `20` or `auto`.
@@ -161,6 +182,56 @@ impl Wheel {
         })
     }
 
+    fn driver(&self) -> Box<dyn Driver> {
+        match self {
+            Wheel::Expert => Box::new(Expert),
+            Wheel::Zero => Box::new(Zero),
+            Wheel::Model(pilot) => pilot.clone(),
+        }
+    }
+
+    /// The video of the first run, begun.
+    fn video(&self, path: &Path, track: &Track, args: &DriveArgs) -> Result<DriveVideo> {
+        let onlooker = match self {
+            Wheel::Model(pilot) if args.saliency => Some(Onlooker::new(Pilot::clone(pilot), true)?),
+            _ if args.saliency => {
+                return Err(Error::Usage(format!("{} has no saliency; leave out --saliency", args.model)));
+            }
+            _ => None,
+        };
+        let names = Names {
+            title: format!("{}, seed {}", track.name(), args.seed),
+            subtitle: args.model.clone(),
+            model: Some(if matches!(self, Wheel::Model(_)) { "model" } else { "driver" }),
+            reference: "expert",
+        };
+        DriveVideo::create(path, track, names, args.fps, onlooker)
+    }
+
+    /// Drives the first run again before the camera.
+    fn film(
+        &self,
+        video: DriveVideo,
+        track: &Track,
+        options: &DriveOptions,
+        args: &DriveArgs,
+        stop: &AtomicBool,
+    ) -> Result<()> {
+        let bar = ShareBar::new("filming");
+        let mut progress = |share| {
+            bar.set(share);
+            !stop.load(Ordering::Relaxed)
+        };
+        let mut driver = self.driver();
+        let (summary, stopped) =
+            video.film(track, driver.as_mut(), &options.of_run(false), options.seed, &mut progress)?;
+        drop(bar);
+        if let Some(path) = &args.video {
+            tell_video(path, &summary);
+        }
+        if stopped { Err(Error::Interrupted) } else { Ok(()) }
+    }
+
     fn drive(
         &self,
         track: &Track,
@@ -169,13 +240,7 @@ impl Wheel {
         live: Option<&Live>,
         stop: &AtomicBool,
     ) -> Result<DriveResult> {
-        let new_driver = || -> Result<Box<dyn Driver>> {
-            Ok(match self {
-                Wheel::Expert => Box::new(Expert),
-                Wheel::Zero => Box::new(Zero),
-                Wheel::Model(pilot) => pilot.clone(),
-            })
-        };
+        let new_driver = || Ok(self.driver());
         let mut result = if let Some(live) = live {
             let pilot = if let Wheel::Model(pilot) = self { Some(&**pilot) } else { None };
             drive_observed(track, new_driver, options, &mut Watch::new(live, name, pilot, options.runs, stop))?

@@ -21,6 +21,7 @@ mod sim;
 mod summary;
 mod tracks;
 mod train;
+mod video;
 
 use std::io::{ErrorKind, Write};
 use std::path::Path;
@@ -57,6 +58,7 @@ enum Command {
     Export(export::ExportArgs),
     Inspect(inspect::InspectArgs),
     Tracks(tracks::TracksArgs),
+    Video(video::VideoArgs),
     Explain(explain::ExplainArgs),
     Compare(compare::CompareArgs),
     Summary(summary::SummaryArgs),
@@ -79,6 +81,7 @@ pub fn main() -> ExitCode {
         Command::Export(args) => export::run(args),
         Command::Inspect(args) => inspect::run(args),
         Command::Tracks(args) => tracks::run(args),
+        Command::Video(args) => video::run(args),
         Command::Explain(args) => explain::run(args),
         Command::Compare(args) => compare::run(args),
         Command::Summary(args) => summary::run(args),

@@ -15,9 +15,9 @@ use crate::new_folder::create_now;
 use crate::serve::client::{ClientOptions, ClientReport, Numbers, Observer, Pace, ServerUrl, drive};
 use crate::serve::protocol::DecimalMark;
 use crate::simulator::Track;
-use crate::simulator::drive::trajectory_csv;
 use crate::simulator::run::{Failure, line_errors_m};
 use crate::simulator::statistics::quantile;
+use crate::simulator::trajectory::trajectory_csv;
 
 /// Put the built-in simulator in the place of Udacity's: it connects to a driving server, as `serve` is one
 #[derive(Debug, Args)]

@@ -12,6 +12,7 @@ use serde::Serialize;
 use crate::error::{Error, Result};
 use crate::new_folder::NewFolder;
 use crate::pilot::Pilot;
+use crate::report::map;
 use crate::simulator::drive::write_trajectories;
 use crate::simulator::eye::Eye;
 use crate::simulator::recorder::drive_expert;
@@ -75,7 +76,9 @@ pub fn test_on_track(
     let folder =
         keep.map(|keep| keep.join(track.name().replace(['/', '\\', ':'], "-"))).filter(|folder| !folder.exists());
     if let Some(folder) = folder {
-        write_trajectories(&drive, NewFolder::create(&folder)?)?;
+        let folder = NewFolder::create(&folder)?;
+        map::write(track, &drive, &folder)?;
+        write_trajectories(&drive, folder)?;
     }
     Ok(TrackResult { drive: drive.summary, offline_mae_deg })
 }

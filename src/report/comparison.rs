@@ -3,14 +3,13 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use serde::Deserialize;
-
 use super::chart::{Axis, Chart, Mark};
 use super::html::Page;
 use super::map::{self, Place};
 use super::palette;
 use crate::error::{Error, Result};
 use crate::recipe::Recipe;
+use crate::simulator::trajectory::{Waypoint, read_trajectory};
 use crate::simulator::{DriveSummary, Track};
 use crate::training::{EpochRecord, RunFolder, TrainResult};
 use steersman_kernels::Isa;
@@ -37,15 +36,6 @@ pub struct RunView {
 struct DriveView {
     summary: DriveSummary,
     ways: Vec<Vec<Place>>,
-}
-
-/// A line of a trajectory.
-#[derive(Deserialize)]
-struct Moment {
-    x_m: f64,
-    y_m: f64,
-    cte_m: f64,
-    intervention: u8,
 }
 
 /// Reads the runs in `folders`.
@@ -102,15 +92,8 @@ fn find_drives(folder: &Path, depth: usize, drives: &mut Vec<DriveView>) -> Resu
 }
 
 fn read_way(path: &Path) -> Result<Vec<Place>> {
-    let bytes = std::fs::read(path).map_err(Error::io(path))?;
-    let mut way = Vec::new();
-    for moment in csv::Reader::from_reader(&bytes[..]).deserialize() {
-        let line = way.len() as u64 + 2;
-        let Moment { x_m, y_m, cte_m, intervention } =
-            moment.map_err(|e: csv::Error| Error::data_at(path, line, e.to_string()))?;
-        way.push(Place { x: x_m, y: y_m, cte_m, put_back: intervention > 0 });
-    }
-    Ok(way)
+    let place = |w: Waypoint| Place { x: w.x_m, y: w.y_m, cte_m: w.cte_m, put_back: w.intervention > 0 };
+    Ok(read_trajectory(path)?.into_iter().map(place).collect())
 }
 
 /// The page.

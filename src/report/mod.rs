@@ -10,6 +10,7 @@ pub mod explanation;
 pub mod footage;
 pub mod html;
 pub mod inspection;
+mod lettering;
 pub mod map;
 mod metrics;
 pub mod network_diagram;
@@ -21,5 +22,6 @@ pub mod sparkline;
 pub mod split_view;
 pub mod steering;
 pub mod svg;
+pub mod video;
 
 pub use metrics::{Metrics, Prediction, correlation};

@@ -119,6 +119,7 @@ impl<'a> ClosedLoop<'a> {
             time_s: self.simulation.time_s(),
             x: self.simulation.car.x,
             y: self.simulation.car.y,
+            heading_deg: self.simulation.car.hy.atan2(self.simulation.car.hx).to_degrees(),
             s_m: self.simulation.location.s_m,
             cte_m: self.simulation.cte_m(),
             steering,

@@ -1,6 +1,5 @@
 //! Many closed-loop runs of one driver on one track, and the comparison of two drivers.
 
-use std::fmt::Write as _;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Instant;
 
@@ -12,6 +11,7 @@ use super::run::{Driver, Expert, INTERVENTION_M, Run, RunOptions, line_errors_m,
 use super::speed::Speed;
 use super::statistics::{PairedTest, wilson_interval};
 use super::track::Track;
+use super::trajectory::trajectory_csv;
 use crate::new_folder::NewFolder;
 use crate::{Error, Result};
 
@@ -35,6 +35,14 @@ pub struct DriveOptions {
 impl Default for DriveOptions {
     fn default() -> Self {
         DriveOptions { laps: 1, runs: 10, seed: 1, speed: Speed::Fixed(20.0), latency_ms: 0.0, noise: 0.0 }
+    }
+}
+
+impl DriveOptions {
+    /// How a run of the drive is driven, free or assisted.
+    pub fn of_run(&self, assisted: bool) -> RunOptions {
+        let DriveOptions { laps, speed, latency_ms, noise, .. } = *self;
+        RunOptions { laps, speed, latency_ms, noise, assisted }
     }
 }
 
@@ -177,19 +185,12 @@ fn measure<F>(
 where
     F: Fn() -> Result<Box<dyn Driver>>,
 {
-    let of_run = |assisted| RunOptions {
-        laps: options.laps,
-        speed: options.speed,
-        latency_ms: options.latency_ms,
-        noise: options.noise,
-        assisted,
-    };
     let seed = options.seed.wrapping_add(k);
     let mut go = |assisted| {
         let mut driver = new_driver()?;
         match &mut observer {
-            Some(observer) => run_observed(track, driver.as_mut(), &of_run(assisted), seed, &mut **observer),
-            None => run(track, driver.as_mut(), &of_run(assisted), seed),
+            Some(observer) => run_observed(track, driver.as_mut(), &options.of_run(assisted), seed, &mut **observer),
+            None => run(track, driver.as_mut(), &options.of_run(assisted), seed),
         }
     };
     let began = Instant::now();
@@ -204,7 +205,7 @@ where
         assisted
     };
     let busy_s = began.elapsed().as_secs_f64();
-    let expert = run(track, &mut Expert, &of_run(false), seed)?;
+    let expert = run(track, &mut Expert, &options.of_run(false), seed)?;
     Ok(Measured { pair: RunPair { seed, free, assisted }, expert, simulated_s, busy_s })
 }
 
@@ -318,28 +319,6 @@ pub fn write_trajectories(result: &DriveResult, folder: NewFolder) -> Result<()>
     let text = serde_json::to_string_pretty(&result.summary).map_err(|e| Error::data(&path, e.to_string()))?;
     std::fs::write(&path, text + "\n").map_err(|source| folder.explain(Error::Io { path, source }))?;
     folder.finish()
-}
-
-/// A run as CSV text, one line for each frame.
-pub fn trajectory_csv(run: &Run) -> String {
-    let mut text = String::from("time_s,x_m,y_m,s_m,cte_m,steering,throttle,speed_mph,intervention\n");
-    for m in &run.moments {
-        // Writing to a string cannot fail.
-        let _ = writeln!(
-            text,
-            "{:.2},{:.4},{:.4},{:.3},{:.4},{:.5},{:.4},{:.3},{}",
-            m.time_s,
-            m.x,
-            m.y,
-            m.s_m,
-            m.cte_m,
-            m.steering,
-            m.throttle,
-            m.speed_mph,
-            u8::from(m.intervention)
-        );
-    }
-    text
 }
 
 #[cfg(test)]

@@ -33,6 +33,7 @@ pub mod speed;
 pub mod statistics;
 mod terrain;
 pub mod track;
+pub mod trajectory;
 mod world;
 pub mod writer;
 

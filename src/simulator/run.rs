@@ -87,6 +87,8 @@ pub struct Moment {
     pub x: f64,
     /// North, m.
     pub y: f64,
+    /// Where the car points: deg, anticlockwise from east.
+    pub heading_deg: f64,
     /// Place along the line, m.
     pub s_m: f64,
     /// Cross-track error, m, + = right as driven.

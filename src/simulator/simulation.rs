@@ -92,6 +92,34 @@ impl<'a> Simulation<'a> {
         (self.car.hx * self.location.ty - self.car.hy * self.location.tx) * self.sign()
     }
 
+    /// A car at the place (`x`, `y`), m, pointing to `heading_deg`, anticlockwise from east. Which way round it drives follows
+    /// from that.
+    pub fn posed(track: &'a Track, [x, y]: [f64; 2], heading_deg: f64, speed_mps: f64) -> Simulation<'a> {
+        let (hy, hx) = sin_cos(heading_deg.to_radians());
+        let location = track.locate(x, y);
+        let mut simulation = Simulation {
+            track,
+            car: Car::new(x, y, hx, hy, speed_mps),
+            location,
+            reverse: hx * location.tx + hy * location.ty < 0.0,
+            steps: 0,
+            progress_m: 0.0,
+            wheels_off: 0,
+            at_wall: false,
+        };
+        simulation.feel();
+        simulation
+    }
+
+    /// Takes the car to where a trajectory leads, counting the way and one step of time; otherwise as
+    /// [`posed`](Simulation::posed).
+    pub fn pose(&mut self, [x, y]: [f64; 2], heading_deg: f64, speed_mps: f64) {
+        let (hy, hx) = sin_cos(heading_deg.to_radians());
+        let steering = self.car.steering;
+        self.car = Car { steering, ..Car::new(x, y, hx, hy, speed_mps) };
+        self.arrive();
+    }
+
     /// Puts the car elsewhere on the track; way and time go on.
     pub fn put(&mut self, start: Start, speed_mps: f64) {
         let steering = self.car.steering;
@@ -117,6 +145,11 @@ impl<'a> Simulation<'a> {
     /// Moves by one step of 20 ms.
     pub fn step(&mut self, controls: Controls) {
         self.car.step(controls, self.slope(), self.wheels_off as f64 / 4.0);
+        self.arrive();
+    }
+
+    /// Finds where the car has come to, a step after it was elsewhere.
+    fn arrive(&mut self) {
         let before = self.location.s_m;
         self.location = self.track.locate_near(self.car.x, self.car.y, self.location.station);
         let length = self.track.length_m;

@@ -5,9 +5,9 @@ use std::path::Path;
 
 use sha2::{Digest, Sha256};
 
-use super::drive::trajectory_csv;
 use super::run::run;
 use super::spec::TrackSpec;
+use super::trajectory::trajectory_csv;
 use super::*;
 use crate::Error;
 

@@ -1,0 +1,93 @@
+//! `steersman video`: recordings and drives as video files.
+
+use std::path::{Path, PathBuf};
+use std::sync::atomic::Ordering;
+
+use clap::Args;
+use serde::Serialize;
+
+use super::share_bar::ShareBar;
+use super::{print_json, stop_on_ctrl_c};
+use crate::error::{Error, Result};
+use crate::pilot::Pilot;
+use crate::report::video::replay::{self, Choice};
+use crate::report::video::{Onlooker, VideoSummary, recording};
+
+/// Write a recording or a saved drive as a video that browsers and VLC play
+#[derive(Debug, Args)]
+pub struct VideoArgs {
+    /// A recording, or a folder that `drive --out` wrote
+    #[arg(value_name = "RECORDING|DRIVE")]
+    source: PathBuf,
+    /// Where to write: H.264 in an .mp4 file, which must not exist
+    file: PathBuf,
+    /// A model whose steering is shown too
+    #[arg(long)]
+    model: Option<PathBuf>,
+    /// Colour what excites the model
+    #[arg(long, requires = "model")]
+    saliency: bool,
+    /// Pictures a second [default: as recorded, 20 for a drive]
+    #[arg(long, value_name = "N")]
+    fps: Option<f64>,
+    /// The run of a drive with this seed [default: the first]
+    #[arg(long)]
+    seed: Option<u64>,
+    /// The run of a drive in which the car was put back where it went astray
+    #[arg(long)]
+    assisted: bool,
+    /// Print one JSON object as the last line
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Serialize)]
+struct Answer<'a> {
+    file: &'a Path,
+    #[serde(flatten)]
+    summary: VideoSummary,
+}
+
+pub fn run(args: VideoArgs) -> Result<()> {
+    let onlooker = match &args.model {
+        Some(model) => Some(Onlooker::new(Pilot::load(model)?, args.saliency)?),
+        None => None,
+    };
+    let is_drive = replay::is_drive(&args.source);
+    let below = if is_drive { Vec::new() } else { replay::drives_below(&args.source) };
+    if !below.is_empty() {
+        let names: Vec<String> = below.iter().map(|path| path.display().to_string()).collect();
+        let message = format!("holds several drives; name one of {}", names.join(", "));
+        return Err(Error::Usage(format!("{} {message}", args.source.display())));
+    }
+    if !is_drive && (args.seed.is_some() || args.assisted) {
+        let message = "is no folder of `drive --out`, so there is no run to choose; leave out --seed and --assisted";
+        return Err(Error::Usage(format!("{} {message}", args.source.display())));
+    }
+    let stop = stop_on_ctrl_c()?;
+    let bar = ShareBar::new("filming");
+    let mut progress = |share| {
+        bar.set(share);
+        !stop.load(Ordering::Relaxed)
+    };
+    let (summary, stopped) = if is_drive {
+        let choice = Choice { seed: args.seed, assisted: args.assisted };
+        replay::film(&args.source, choice, &args.file, onlooker, args.fps, &mut progress)?
+    } else {
+        recording::film(&args.source, &args.file, onlooker, args.fps, &mut progress)?
+    };
+    drop(bar);
+    if args.json {
+        print_json(&Answer { file: &args.file, summary })?;
+    } else {
+        tell_video(&args.file, &summary);
+    }
+    if stopped { Err(Error::Interrupted) } else { Ok(()) }
+}
+
+/// Says on standard error what was written.
+pub(super) fn tell_video(path: &Path, summary: &VideoSummary) {
+    let VideoSummary { frames, fps, seconds, bytes } = summary;
+    let megabytes = *bytes as f64 / 1e6;
+    eprintln!("wrote {}: {seconds:.1} s, {frames} pictures at {fps:.4} a second, {megabytes:.1} MB", path.display());
+}

@@ -1,0 +1,110 @@
+//! The video of a run as it is driven.
+
+use std::path::Path;
+
+use super::panel::{Names, Panel, Scene};
+use super::{Onlooker, Video, VideoSummary};
+use crate::dataset::decode::RgbImage;
+use crate::error::{Error, Result};
+use crate::simulator::car::MAX_STEER_DEG;
+use crate::simulator::run::{DRIVE_HZ, Failure};
+use crate::simulator::{DriveFrame, DriveObserver, Driver, HEIGHT, Run, RunOptions, Track, WIDTH, run_observed};
+
+/// A video of a run that is yet to be driven.
+pub struct DriveVideo {
+    video: Video,
+    scene: Scene,
+    /// Colours the picture, if that was asked for; steers nothing.
+    onlooker: Option<Onlooker>,
+}
+
+/// Films while the run goes on.
+struct Filming<'a> {
+    film: &'a mut DriveVideo,
+    /// Whether the driver looks at pictures, so that its time to answer means something.
+    looks: bool,
+    progress: &'a mut dyn FnMut(f64) -> bool,
+}
+
+impl DriveVideo {
+    /// A video in the new file `path` of a run on `track`, with `fps` pictures a second, as many as the driver sees if none is
+    /// given. `names.model` drives.
+    ///
+    /// # Errors
+    ///
+    /// As [`Video::create`].
+    pub fn create(
+        path: &Path,
+        track: &Track,
+        names: Names,
+        fps: Option<f64>,
+        onlooker: Option<Onlooker>,
+    ) -> Result<DriveVideo> {
+        let video = Video::create(path, Panel::new(names, Some(track)), fps.unwrap_or(DRIVE_HZ as f64))?;
+        let scene = Scene { picture: RgbImage::filled(HEIGHT, WIDTH, [0; 3]), ..Scene::default() };
+        Ok(DriveVideo { video, scene, onlooker })
+    }
+
+    /// Drives the run `seed`, as [`run`](crate::simulator::run::run) does and to the same bits, and writes the video. `progress`
+    /// is told the share of the way that is made and may return `false` to stop; what there is by then is written, and the second
+    /// value is `true`.
+    ///
+    /// # Errors
+    ///
+    /// If a picture cannot be encoded or the file cannot be written.
+    pub fn film(
+        mut self,
+        track: &Track,
+        driver: &mut dyn Driver,
+        options: &RunOptions,
+        seed: u64,
+        progress: &mut dyn FnMut(f64) -> bool,
+    ) -> Result<(VideoSummary, bool)> {
+        let looks = driver.needs_frame();
+        match run_observed(track, driver, options, seed, &mut Filming { film: &mut self, looks, progress }) {
+            Ok(run) => Ok((self.video.finish(&outcome(&run, options))?, false)),
+            Err(Error::Interrupted) => Ok((self.video.finish("stopped")?, true)),
+            Err(error) => Err(error),
+        }
+    }
+}
+
+impl DriveObserver for Filming<'_> {
+    fn frame(&mut self, frame: &DriveFrame) -> Result<()> {
+        let DriveVideo { video, scene, onlooker } = &mut *self.film;
+        let simulation = frame.simulation;
+        scene.picture.pixels.clone_from(&frame.picture.pixels);
+        if let Some(onlooker) = onlooker {
+            onlooker.look(&mut scene.picture)?;
+        }
+        scene.time_s = simulation.time_s();
+        scene.model_deg = Some(frame.steering * MAX_STEER_DEG);
+        scene.reference_deg = Some(frame.expert_steering * MAX_STEER_DEG);
+        scene.speed_mph = Some(frame.speed_mph);
+        scene.cte_m = Some(simulation.cte_m());
+        scene.answered_in = self.looks.then_some(frame.answered_in);
+        scene.lap = Some((frame.lap(), Some(frame.options.laps)));
+        scene.place = Some([simulation.car.x, simulation.car.y]);
+        scene.put_back = frame.put_back;
+        video.show(scene)?;
+        let way_m = frame.options.laps as f64 * simulation.track.length_m;
+        match (self.progress)((simulation.progress_m / way_m).clamp(0.0, 1.0)) {
+            true => Ok(()),
+            false => Err(Error::Interrupted),
+        }
+    }
+}
+
+/// What a run came to, in a few words.
+fn outcome(run: &Run, options: &RunOptions) -> String {
+    let time_s = run.time_s;
+    match run.failure {
+        Some(Failure::Crash) => format!("hit a wall after {time_s:.1} s"),
+        Some(Failure::LeftRoad) => format!("left the road after {time_s:.1} s"),
+        Some(Failure::StoodStill) => format!("stood still after {time_s:.1} s"),
+        None if run.laps_completed < options.laps => format!("too slow: stopped after {time_s:.1} s"),
+        None if run.interventions > 0 => format!("{time_s:.1} s, put back {} times", run.interventions),
+        None if options.laps == 1 => format!("lap completed in {time_s:.1} s"),
+        None => format!("{} laps completed in {time_s:.1} s", options.laps),
+    }
+}

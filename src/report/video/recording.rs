@@ -1,0 +1,79 @@
+//! The video of a recording: what the camera saw and how the person steered, beside what a model would have done.
+
+use std::path::Path;
+
+use super::panel::{Names, Panel, Scene};
+use super::{Onlooker, Video, VideoSummary};
+use crate::dataset::decode::decode_rgb;
+use crate::dataset::{self, Camera, Recording};
+use crate::error::{Error, Result};
+use crate::simulator::car::MAX_STEER_DEG;
+
+/// Pictures a second where no session has two rows.
+const LONE_ROW_HZ: f64 = 20.0;
+
+/// Writes the video of the recording `path` to the new file `out`: `fps` pictures a second, or as many as were recorded.
+/// Sessions follow each other without the time between them. `progress` is told the share that is done and may return `false`
+/// to stop; what there is by then is written, and the second value is `true`.
+///
+/// # Errors
+///
+/// As [`dataset::load`] and [`Video::create`]; [`Error::Io`] and [`Error::Data`] for a picture that cannot be read.
+pub fn film(
+    path: &Path,
+    out: &Path,
+    mut onlooker: Option<Onlooker>,
+    fps: Option<f64>,
+    progress: &mut dyn FnMut(f64) -> bool,
+) -> Result<(VideoSummary, bool)> {
+    let recording = dataset::load(path)?;
+    recording.require_usable()?;
+    let full_lock_deg = onlooker.as_ref().map_or(MAX_STEER_DEG, Onlooker::full_lock_deg);
+    let own = recording.rate_hz().unwrap_or(LONE_ROW_HZ);
+    let names = Names {
+        title: name(path),
+        subtitle: format!("recording, {} rows, {own:.3} Hz", recording.rows.len()).replace(".000", ""),
+        model: onlooker.as_ref().map(|_| "model"),
+        reference: "human",
+    };
+    let mut video = Video::create(out, Panel::new(names, None), fps.unwrap_or(own.clamp(1.0, 60.0)))?;
+    let mut scene = Scene::default();
+    let mut session_begins_s = 0.0;
+    let mut stopped = false;
+    'sessions: for session in &recording.sessions {
+        let first_ms = recording.rows[session.start].time_ms;
+        for row in session.clone() {
+            let at = &recording.rows[row];
+            read(&recording, row, &mut scene)?;
+            let looked = onlooker.as_mut().map(|onlooker| onlooker.look(&mut scene.picture)).transpose()?;
+            scene.time_s = session_begins_s + (at.time_ms - first_ms) as f64 / 1000.0;
+            scene.model_deg = looked.map(|(deg, _)| deg);
+            scene.answered_in = looked.map(|(_, took)| took);
+            scene.reference_deg = Some(f64::from(at.steering) * full_lock_deg);
+            scene.speed_mph = Some(f64::from(at.speed_mph)).filter(|mph| mph.is_finite());
+            video.show(&scene)?;
+            if !progress((row + 1) as f64 / recording.rows.len() as f64) {
+                stopped = true;
+                break 'sessions;
+            }
+        }
+        session_begins_s += recording.session_s(session) + 1.0 / own;
+    }
+    let text = if stopped { "stopped" } else { "end of the recording" };
+    Ok((video.finish(text)?, stopped))
+}
+
+/// The folder of a recording, also where its log was named.
+fn name(path: &Path) -> String {
+    let folder = if path.is_file() { path.parent().unwrap_or(path) } else { path };
+    let folder = folder.canonicalize().unwrap_or(folder.to_path_buf());
+    folder.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
+}
+
+fn read(recording: &Recording, row: usize, scene: &mut Scene) -> Result<()> {
+    let path = recording.image_path(row, Camera::Centre);
+    let path =
+        path.ok_or_else(|| Error::data(&recording.path, format!("row {row} has no picture of the centre camera")))?;
+    let bytes = std::fs::read(&path).map_err(Error::io(&path))?;
+    decode_rgb(&bytes, &mut scene.picture).map_err(|message| Error::data(&path, message))
+}

@@ -1,0 +1,148 @@
+//! The video of a drive that was saved: the simulator's camera goes along the trajectory again.
+
+use std::path::{Path, PathBuf};
+
+use super::panel::{Names, Panel, Scene};
+use super::{Onlooker, Video, VideoSummary};
+use crate::dataset::decode::RgbImage;
+use crate::error::{Error, Result};
+use crate::report::lettering::end_of;
+use crate::simulator::car::{MAX_STEER_DEG, MPS_PER_MPH};
+use crate::simulator::eye::Eye;
+use crate::simulator::run::DRIVE_HZ;
+use crate::simulator::trajectory::{Waypoint, read_trajectory};
+use crate::simulator::{DriveSummary, HEIGHT, Simulation, Track, WIDTH, expert};
+
+/// Which run of a drive, and how.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Choice {
+    /// Its seed; the first there is if none is given.
+    pub seed: Option<u64>,
+    /// The run in which the car was put back, instead of the one in which nobody helped.
+    pub assisted: bool,
+}
+
+/// Whether `path` is a folder that `drive --out` wrote.
+pub fn is_drive(path: &Path) -> bool {
+    path.join("summary.json").is_file() && !trajectories(path).is_empty()
+}
+
+/// Writes the video of a run of the drive in `folder` to the new file `out`. What steered is drawn as it was saved; an
+/// `onlooker` steers in its place, without changing the way. `progress` and the result are as in
+/// [`recording::film`](super::recording::film).
+///
+/// # Errors
+///
+/// [`Error::Usage`] if there is no such run, [`Error::Data`] for files that are not as `drive --out` writes them; as
+/// [`Video::create`] and [`Track::load`].
+pub fn film(
+    folder: &Path,
+    choice: Choice,
+    out: &Path,
+    mut onlooker: Option<Onlooker>,
+    fps: Option<f64>,
+    progress: &mut dyn FnMut(f64) -> bool,
+) -> Result<(VideoSummary, bool)> {
+    let (seed, path) = choose(folder, choice)?;
+    let track = Track::load(&summary(folder)?.track)?;
+    let way = read_trajectory(&path)?;
+    let poses: Vec<f64> = way.iter().map_while(|waypoint| waypoint.heading_deg).collect();
+    if poses.len() < way.len() {
+        let message =
+            "there is no column heading_deg, without which the camera has no direction; drive again with --out";
+        return Err(Error::data(&path, message));
+    }
+    let Some(first) = way.first() else {
+        return Err(Error::data(&path, "the trajectory has no rows"));
+    };
+    let speed_mps = |waypoint: &Waypoint| waypoint.speed_mph * MPS_PER_MPH;
+    let mut simulation = Simulation::posed(&track, [first.x_m, first.y_m], poses[0], speed_mps(first));
+    let kind = if choice.assisted { "assisted" } else { "free" };
+    let names = Names {
+        title: format!("{}, {kind}, seed {seed}", track.name()),
+        subtitle: end_of(&folder.display().to_string(), 36),
+        model: Some(if onlooker.is_some() { "model" } else { "driver" }),
+        reference: "expert",
+    };
+    let panel = Panel::new(names, Some(&track));
+    let mut video = Video::create(out, panel, fps.unwrap_or(DRIVE_HZ as f64))?;
+    let mut eye = Eye::new(&track, seed);
+    let mut scene = Scene { picture: RgbImage::filled(HEIGHT, WIDTH, [0; 3]), ..Scene::default() };
+    let (mut stopped, mut put_back) = (false, 0);
+    for (k, (waypoint, heading_deg)) in way.iter().zip(&poses).enumerate() {
+        simulation.pose([waypoint.x_m, waypoint.y_m], *heading_deg, speed_mps(waypoint));
+        scene.picture.pixels.clone_from(&eye.look(&simulation)?.pixels);
+        let looked = onlooker.as_mut().map(|onlooker| onlooker.look(&mut scene.picture)).transpose()?;
+        scene.time_s = waypoint.time_s;
+        scene.model_deg = Some(looked.map_or(waypoint.steering * MAX_STEER_DEG, |(deg, _)| deg));
+        scene.answered_in = looked.map(|(_, took)| took);
+        scene.reference_deg = Some(expert::pursuit(&simulation) * MAX_STEER_DEG);
+        scene.speed_mph = Some(waypoint.speed_mph);
+        scene.cte_m = Some(waypoint.cte_m);
+        scene.lap = Some(((simulation.progress_m / track.length_m).max(0.0) as usize + 1, None));
+        scene.place = Some([waypoint.x_m, waypoint.y_m]);
+        scene.put_back = waypoint.intervention > 0;
+        put_back += usize::from(scene.put_back);
+        video.show(&scene)?;
+        if !progress((k + 1) as f64 / way.len() as f64) {
+            stopped = true;
+            break;
+        }
+    }
+    let text = match (stopped, put_back) {
+        (true, _) => "stopped".into(),
+        (false, 0) => format!("end of the run after {:.1} s", scene.time_s),
+        (false, times) => format!("{:.1} s, put back {times} times", scene.time_s),
+    };
+    Ok((video.finish(&text)?, stopped))
+}
+
+/// Folders of drives in `folder` and below, as training runs keep them.
+pub fn drives_below(folder: &Path) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
+    let mut folders: Vec<PathBuf> = entries.filter(|path| path.is_dir()).collect();
+    folders.sort();
+    let found = |path: PathBuf| if is_drive(&path) { vec![path] } else { drives_in(&path) };
+    folders.into_iter().flat_map(found).collect()
+}
+
+/// Folders of drives directly in `folder`.
+fn drives_in(folder: &Path) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
+    let mut found: Vec<PathBuf> = entries.filter(|path| is_drive(path)).collect();
+    found.sort();
+    found
+}
+
+fn summary(folder: &Path) -> Result<DriveSummary> {
+    let path = folder.join("summary.json");
+    let text = std::fs::read_to_string(&path).map_err(Error::io(&path))?;
+    serde_json::from_str(&text).map_err(|e| Error::data_at(&path, e.line() as u64, e.to_string()))
+}
+
+/// The trajectories in a folder: kind, seed, file; in the order of the seeds.
+fn trajectories(folder: &Path) -> Vec<(String, u64, PathBuf)> {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
+    let mut found: Vec<_> = entries
+        .filter_map(|path| {
+            let (kind, seed) = path.file_name()?.to_str()?.strip_suffix(".csv")?.split_once('_')?;
+            let known = ["free", "assisted"].contains(&kind);
+            known.then_some(()).and(Some((kind.to_string(), seed.parse().ok()?, path.clone())))
+        })
+        .collect();
+    found.sort_by_key(|(_, seed, _)| *seed);
+    found
+}
+
+fn choose(folder: &Path, choice: Choice) -> Result<(u64, PathBuf)> {
+    let kind = if choice.assisted { "assisted" } else { "free" };
+    let found: Vec<_> = trajectories(folder).into_iter().filter(|(of_kind, ..)| of_kind == kind).collect();
+    let seeds: Vec<String> = found.iter().map(|(_, seed, _)| seed.to_string()).collect();
+    let chosen = found.into_iter().find(|(_, seed, _)| choice.seed.is_none_or(|wanted| wanted == *seed));
+    chosen.map(|(_, seed, path)| (seed, path)).ok_or_else(|| {
+        let wanted = choice.seed.map_or(String::new(), |seed| format!(" with seed {seed}"));
+        let there =
+            if seeds.is_empty() { "there are none".into() } else { format!("seeds there: {}", seeds.join(", ")) };
+        Error::Usage(format!("{}: no {kind} run{wanted}; {there}", folder.display()))
+    })
+}
