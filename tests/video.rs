@@ -61,7 +61,7 @@ fn a_drive_has_a_video_as_long_as_it_took_and_the_saved_one_looks_the_same() {
     assert!((length_s - f64::from(pictures) / 20.0).abs() < 0.01, "{length_s}");
 
     let map = fs::read_to_string(dir.join("d/map.svg")).unwrap();
-    assert!(roxmltree::Document::parse(&map).is_ok() && map.contains("lake: 2 runs, put back"), "{map}");
+    assert!(roxmltree::Document::parse(&map).is_ok() && map.contains("lake, runs: 2, put back: "), "{map}");
 
     let again = json(dir, &["video", "d", "b.mp4", "--json"]);
     assert_eq!(read(&dir.join("b.mp4")).0, pictures);
