@@ -142,8 +142,8 @@ fn a_video_that_was_interrupted_plays_as_far_as_it_came() {
         .spawn()
         .unwrap();
     // The summary is printed before the filming begins.
-    let mut first = String::new();
-    std::io::BufRead::read_line(&mut BufReader::new(child.stdout.take().unwrap()), &mut first).unwrap();
+    let (mut first, mut printed) = (String::new(), BufReader::new(child.stdout.take().unwrap()));
+    std::io::BufRead::read_line(&mut printed, &mut first).unwrap();
     assert!(first.contains("expert on lake"), "{first}");
     std::thread::sleep(std::time::Duration::from_secs(3));
     assert!(Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap().success());
