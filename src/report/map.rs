@@ -39,7 +39,7 @@ pub fn write(track: &Track, result: &DriveResult, folder: &NewFolder) -> Result<
     let drives: Vec<Vec<Place>> =
         result.runs.iter().map(|pair| pair.assisted.moments.iter().map(place).collect()).collect();
     let DriveSummary { runs, interventions, .. } = result.summary;
-    let title = format!("{}: {runs} runs, put back {interventions} times", track.name());
+    let title = format!("{}, runs: {runs}, put back: {interventions}", track.name());
     let path = folder.unfinished().join("map.svg");
     let written = std::fs::write(&path, draw(&title, Some(track), &drives, PAGE));
     written.map_err(|source| folder.explain(Error::Io { path, source }))

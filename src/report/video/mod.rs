@@ -1,6 +1,6 @@
 //! Videos of drives: the camera's picture, who steers how, and the way on the map, as H.264 in an MP4 file.
 //!
-//! [`file`] writes the file picture by picture, [`pace`] shows each moment as long as it lasted, [`panel`] paints, and
+//! [`mod@file`] writes the file picture by picture, [`pace`] shows each moment as long as it lasted, [`panel`] paints, and
 //! [`drive`], [`replay`] and [`recording`] say what there is to see: a run as it is driven, one that was saved, and a
 //! recording.
 
