@@ -55,7 +55,7 @@ fn the_same_seed_gives_the_same_log_images_and_trajectories_for_any_number_of_th
         (files, summary["cte_rms_m"].clone(), summary["distance_m"].clone())
     };
     let first = drive("1", "7", "drive-one");
-    assert_eq!(first.0.len(), 6);
+    assert_eq!(first.0.len(), 7, "three free runs, three assisted ones, and the map");
     assert_eq!(first, drive("2", "7", "drive-two"));
     assert_eq!(first, drive("5", "7", "drive-five"));
     assert_ne!(first, drive("1", "8", "drive-other"));
@@ -160,10 +160,10 @@ fn bad_track_files_are_refused_with_place_and_remedy() {
     assert!(open.contains("not closed") && open.contains("points[23]"), "{open}");
     assert_eq!(names(dir), ["bad.toml"], "nothing is left behind");
 
-    // The file as it is drives, under its path.
+    // The file as it is drives, under its name and path.
     fs::write(dir.join("good.toml"), lake).unwrap();
     let made = json(dir, &["record", "--track", "good.toml", "--laps", "0.01", "--out", "out", "--json"]);
-    assert_eq!(made["track"], "lake");
+    assert_eq!(made["track"], "lake (good.toml)", "not to be taken for the built-in track");
 }
 
 #[test]
