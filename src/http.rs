@@ -125,8 +125,8 @@ pub(crate) fn listen(address: SocketAddr, in_use: &str) -> Result<TcpListener> {
         let remedy = match error.kind() {
             ErrorKind::AddrInUse => &format!("another program has this port: {in_use}"),
             ErrorKind::PermissionDenied => "give a --port of 1024 or more",
-            ErrorKind::AddrNotAvailable => "give this machine's own address with --host, or 0.0.0.0 for all",
-            _ => "give another --host or --port",
+            ErrorKind::AddrNotAvailable => "give this machine's own address, or 0.0.0.0 for all",
+            _ => "give another address or port",
         };
         Error::Usage(format!("cannot listen at {address}: {error}; {remedy}"))
     })

@@ -125,8 +125,9 @@ pub fn run(args: DriveArgs) -> Result<()> {
     if let Some(live) = live {
         let DriveSummary { laps_completed, laps_total, autonomy_percent, cte_mean_m, .. } = &result.summary;
         live.finish(&format!(
-            "The drive is over: {laps_completed} of {laps_total} laps completed, autonomy {autonomy_percent:.1} %, on average \
-             {cte_mean_m:.2} m off the middle."
+            "The drive of {} is over: {laps_completed} of {laps_total} laps completed, autonomy {autonomy_percent:.1} %, on average \
+             {cte_mean_m:.2} m off the middle.",
+            args.model
         ));
     }
     let comparison = other.as_ref().map_or(Ok(Vec::new()), |other| compare(&result, other))?;

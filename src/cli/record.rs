@@ -142,8 +142,9 @@ fn drive_by_hand(args: &RecordArgs, track: &Track, options: &RecordOptions) -> R
     println!(
         "{minutes:.1} minutes, {laps:.1} laps; {left} left, {straight} straight, {right} right; {recovery} ways back"
     );
+    println!("for the next recording:");
     for advice in &summary.advice {
-        println!("{advice}");
+        println!("  {advice}");
     }
     Ok(())
 }

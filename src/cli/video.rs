@@ -57,7 +57,7 @@ pub fn run(args: VideoArgs) -> Result<()> {
     let below = if is_drive { Vec::new() } else { replay::drives_below(&args.source) };
     if !below.is_empty() {
         let names: Vec<String> = below.iter().map(|path| path.display().to_string()).collect();
-        let message = format!("holds several drives; name one of {}", names.join(", "));
+        let message = format!("holds drives and is none itself; name one of {}", names.join(", "));
         return Err(Error::Usage(format!("{} {message}", args.source.display())));
     }
     if !is_drive && (args.seed.is_some() || args.assisted) {
@@ -87,7 +87,10 @@ pub fn run(args: VideoArgs) -> Result<()> {
 
 /// Says on standard error what was written.
 pub(super) fn tell_video(path: &Path, summary: &VideoSummary) {
-    let VideoSummary { frames, fps, seconds, bytes } = summary;
+    let VideoSummary { frames, fps, seconds, bytes, unreadable } = summary;
     let megabytes = *bytes as f64 / 1e6;
     eprintln!("wrote {}: {seconds:.1} s, {frames} pictures at {fps:.4} a second, {megabytes:.1} MB", path.display());
+    if *unreadable > 0 {
+        eprintln!("note: {unreadable} pictures are missing or cannot be read; `steersman inspect` names them");
+    }
 }

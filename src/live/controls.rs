@@ -36,7 +36,7 @@ pub struct Wheel {
 }
 
 impl Wheel {
-    /// Takes a request of connection `id` at `now`. Who asks first gets the wheel; what others ask for is ignored as long as it
+    /// Takes a request of connection `id` at `now`. Who steers or takes it first gets the wheel; what others ask for is ignored as long as it
     /// is held, but for taking it.
     pub fn take(&mut self, id: u64, request: Request, now: Instant) {
         let event = match request {
@@ -72,7 +72,8 @@ impl Wheel {
     /// Connection `id` lets go, or is gone.
     pub fn leave(&mut self, id: u64) {
         if self.holder == Some(id) {
-            *self = Wheel::default();
+            // What was asked for before, an end above all, still happens.
+            *self = Wheel { events: std::mem::take(&mut self.events), ..Wheel::default() };
         }
     }
 

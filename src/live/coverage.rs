@@ -134,7 +134,7 @@ impl Coverage {
             advice.push(format!("{} rows are few: a network needs {FEW_ROWS} and more.", self.rows));
         }
         if advice.is_empty() {
-            advice.push("Enough of everything to train with; finish, or drive on.".into());
+            advice.push("Enough of everything to train with.".into());
         }
         advice
     }

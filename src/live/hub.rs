@@ -12,7 +12,7 @@ use super::messages::{Hello, Request, State, Trace, frame};
 
 /// Simulated time between points of the way on the map, s.
 const TRACE_S: f64 = 0.2;
-/// Points kept of a way: a quarter of an hour. Of a longer one every other is forgotten.
+/// Points kept of a way: a quarter of an hour. Of a longer one the older half is forgotten.
 const MOST_TRACES: usize = 4500;
 
 /// The newest frame, and the way up to it.
@@ -90,18 +90,15 @@ impl Hub {
     /// Draws the way on, whether or not somebody looks on.
     pub fn trace(&self, state: &State) {
         let mut newest = lock(&self.newest);
-        if newest.way != state.way || newest.traces.is_empty() {
+        // Time that runs backwards is another drive's.
+        if newest.way != state.way || state.time_s < newest.traced_s || newest.traces.is_empty() {
             newest.traces.clear();
             (newest.way, newest.traced_s) = (state.way, f64::NEG_INFINITY);
         }
         // Times are multiples of a step, but for rounding.
         if state.time_s - newest.traced_s > TRACE_S - 1e-6 {
             if newest.traces.len() >= MOST_TRACES {
-                let mut keep = false;
-                newest.traces.retain(|_| {
-                    keep = !keep;
-                    keep
-                });
+                newest.traces.drain(..MOST_TRACES / 2);
             }
             newest.traced_s = state.time_s;
             newest.traces.push(Trace(state.x as f32, state.y as f32, state.cte_m as f32));
@@ -172,7 +169,11 @@ mod tests {
         }
         let all = trail(&hub);
         let all = all.as_array().unwrap();
-        assert!((MOST_TRACES / 2..=MOST_TRACES).contains(&all.len()) && all[0][0] == 0.0, "{}", all.len());
+        assert!((MOST_TRACES / 2..=MOST_TRACES).contains(&all.len()), "{}", all.len());
+        let next = |k: usize| all[k + 1][0].as_f64().unwrap() - all[k][0].as_f64().unwrap();
+        assert!((0..all.len() - 1).all(|k| next(k) == next(0)), "no gaps: pages do not draw across them");
+        hub.trace(&state(2, 1.0));
+        assert_eq!(trail(&hub).as_array().unwrap().len(), 1, "another drive");
     }
 
     #[test]

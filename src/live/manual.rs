@@ -1,5 +1,6 @@
 //! A person drives with the page, and what they do is recorded in the format of Udacity's simulator.
 
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, Sender, channel};
@@ -19,6 +20,9 @@ use crate::simulator::eye::Eye;
 use crate::simulator::recorder::{RecordingInfo, Sample};
 use crate::simulator::writer::RowWriter;
 use crate::simulator::{RecordOptions, Simulation, Start, Track};
+
+/// What is said where the program itself is at fault.
+const FAULT: &str = "the recording ended early by a fault of this program";
 
 /// Steps between frames: 25 frames a second.
 const STEPS_PER_FRAME: u64 = 2;
@@ -85,15 +89,19 @@ impl<'a> ManualDrive<'a> {
             let (mut steps, mut drive) = (0u64, Ok(true));
             while matches!(drive, Ok(true)) && !stop.load(Ordering::Relaxed) && !writing.is_finished() {
                 std::thread::sleep(clock.until(steps as f64 * STEP_S, Instant::now()));
-                drive = session.step();
+                // A fault here must not take with it what was recorded, nor leave the writer waiting.
+                let step = catch_unwind(AssertUnwindSafe(|| session.step()));
+                drive = step.unwrap_or_else(|_| Err(Error::Usage(FAULT.into())));
                 steps += 1;
             }
             session.samples = None;
+            if !writing.is_finished() {
+                eprintln!("writing the last rows");
+            }
             (drive, writing.join())
         });
         let (rows, trouble) = written.unwrap_or_else(|_| {
-            let fault = "the recording ended early by a fault of this program".to_string();
-            (session.coverage.shares(options.hz, track.length_m).rows, Some(Error::Usage(fault)))
+            (session.coverage.shares(options.hz, track.length_m).rows, Some(Error::Usage(FAULT.into())))
         });
         let trouble = drive.err().or(trouble);
         let advice = session.coverage.advice(track.length_m);
@@ -205,16 +213,21 @@ impl<'a> Session<'a> {
         self.simulation.step(controls);
         let edge_m = self.simulation.track.at(self.simulation.location.s_m).width_m / 2.0;
         if self.simulation.at_wall {
-            self.record(false);
-            self.put(false, "The car hit a wall and was put back; recording is paused.");
+            self.rescue("The car hit a wall and was put back");
         } else if self.simulation.cte_m().abs() > edge_m + LOST_M {
-            self.record(false);
-            self.put(false, "The car was far off the road and was put back; recording is paused.");
+            self.rescue("The car was far off the road and was put back");
         }
         if self.simulation.steps.is_multiple_of(STEPS_PER_FRAME) {
             self.show(driver, controls)?;
         }
         Ok(true)
+    }
+
+    /// Puts the car back after an accident; what led there is not to be learned any further.
+    fn rescue(&mut self, what: &str) {
+        let then = if self.recording { "; recording is paused." } else { "." };
+        self.record(false);
+        self.put(false, &format!("{what}{then}"));
     }
 
     fn record(&mut self, recording: bool) {

@@ -7,7 +7,7 @@
 //! [`watch`] shows a closed-loop drive in real time; [`manual`] lets a person drive, with [`controls`] from the page, and
 //! records it, with [`coverage`] of what is recorded so far.
 //!
-//! Whoever drives could be driven by other pages, so a request counts only if it comes from the page itself: its `Host` must
+//! Whoever drives could be driven by other pages, so a request counts only if it comes from no other page: its `Host` must
 //! be this machine (a name can be made to point here after a page was loaded), and the `Origin` of a WebSocket the same.
 
 mod clock;

@@ -195,7 +195,11 @@ enum Answer {
 
 fn answer(head: &Head, port: u16) -> Answer {
     let refuse = |status: &str, sentence: &str| Answer::Say(http::plain(status, sentence));
-    let own = [format!("127.0.0.1:{port}"), format!("localhost:{port}")];
+    let mut own = vec![format!("127.0.0.1:{port}"), format!("localhost:{port}")];
+    if port == 80 {
+        // Browsers leave it out.
+        own.extend(["127.0.0.1".into(), "localhost".into()]);
+    }
     let is_own = |host: &str| own.iter().any(|own| own.eq_ignore_ascii_case(host));
     let Some(host) = head.header("host").filter(|host| is_own(host)) else {
         return refuse("403 Forbidden", &format!("this page is served as http://{}/ only", own[0]));

@@ -1,4 +1,4 @@
-//! Steering with two keys, as version 2 of Udacity's simulator takes them.
+//! Steering and pedals with keys, as version 2 of Udacity's simulator takes them.
 
 use super::car::STEP_S;
 

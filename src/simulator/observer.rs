@@ -23,8 +23,6 @@ pub struct DriveFrame<'a> {
     pub throttle: f64,
     /// Speed as telemetry carries it, mph.
     pub speed_mph: f64,
-    /// Speed to hold, mph.
-    pub target_mph: f64,
     /// Whether the car was put back since the last frame.
     pub put_back: bool,
     /// Times the car was put back so far; 0 in a free run.

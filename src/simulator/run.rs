@@ -227,7 +227,6 @@ fn drive_run(
                     expert_steering: expert::pursuit(simulation),
                     throttle: moment.throttle,
                     speed_mph,
-                    target_mph,
                     put_back: moment.intervention,
                     interventions: closed_loop.interventions(),
                     answered_in,

@@ -37,6 +37,8 @@ pub struct VideoSummary {
     pub seconds: f64,
     /// Size of the file.
     pub bytes: u64,
+    /// Rows of a recording whose picture is missing or cannot be read; the picture before stays in view.
+    pub unreadable: usize,
 }
 
 /// A video that grows scene by scene.

@@ -249,7 +249,7 @@ impl Panel {
     }
 
     fn paint_figures(&self, scene: &Scene, out: &mut RgbImage) {
-        let minutes = (scene.time_s / 60.0).floor();
+        let tenths = (10.0 * scene.time_s).round() as u64;
         let apart = scene.model_deg.zip(scene.reference_deg).map(|(a, b)| format!("{:.1}°", (a - b).abs()));
         let beside = match self.projection {
             Some(_) => ("from line", scene.cte_m.map(|m| signed(m, 2) + " m")),
@@ -264,7 +264,7 @@ impl Panel {
             beside,
             ("answer in", scene.answered_in.map(|took| format!("{:.1} ms", 1000.0 * took.as_secs_f64()))),
             ("lap", lap),
-            ("time", Some(format!("{minutes:.0}:{:04.1}", scene.time_s - 60.0 * minutes))),
+            ("time", Some(format!("{}:{:02}.{}", tenths / 600, tenths / 10 % 60, tenths % 10))),
         ];
         // What is not known has no place; what is known keeps it.
         for ((caption, text), left) in figures.iter().zip([164, 272, 372, 472, 544]) {

@@ -39,12 +39,19 @@ pub fn film(
     let mut video = Video::create(out, Panel::new(names, None), fps.unwrap_or(own.clamp(1.0, 60.0)))?;
     let mut scene = Scene::default();
     let mut session_begins_s = 0.0;
-    let mut stopped = false;
+    let (mut stopped, mut unreadable) = (false, 0);
     'sessions: for session in &recording.sessions {
         let first_ms = recording.rows[session.start].time_ms;
         for row in session.clone() {
             let at = &recording.rows[row];
-            read(&recording, row, &mut scene)?;
+            // One bad picture does not cost the video; without any good one there is none.
+            if let Err(error) = read(&recording, row, &mut scene) {
+                unreadable += 1;
+                if unreadable == recording.rows.len() {
+                    return Err(error);
+                }
+                continue;
+            }
             let looked = onlooker.as_mut().map(|onlooker| onlooker.look(&mut scene.picture)).transpose()?;
             scene.time_s = session_begins_s + (at.time_ms - first_ms) as f64 / 1000.0;
             scene.model_deg = looked.map(|(deg, _)| deg);
@@ -60,7 +67,7 @@ pub fn film(
         session_begins_s += recording.session_s(session) + 1.0 / own;
     }
     let text = if stopped { "stopped" } else { "end of the recording" };
-    Ok((video.finish(text)?, stopped))
+    Ok((VideoSummary { unreadable, ..video.finish(text)? }, stopped))
 }
 
 /// The folder of a recording, also where its log was named.
