@@ -110,14 +110,7 @@ fn without_a_page_the_car_brakes_and_recording_pauses_and_ctrl_c_loses_nothing()
     guest.ask(&json!({ "type": "record" }));
     guest.ask(&json!({ "type": "finish" }));
     drop(driver);
-    let began = Instant::now();
-    let stopped = loop {
-        let frame = guest.next().unwrap();
-        if frame.number("speed_mph") == 0.0 {
-            break frame;
-        }
-        assert!(began.elapsed() < common::double::SILENCE, "{}", frame.state);
-    };
+    let stopped = guest.until_it_stands();
     let manual = &stopped.state["manual"];
     assert_eq!((&manual["driver"], &manual["recording"]), (&Value::Null, &json!(false)), "{manual}");
     assert!(manual["notice"].as_str().unwrap().contains("Nobody was at the wheel"), "{manual}");

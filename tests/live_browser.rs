@@ -105,14 +105,7 @@ fn a_hidden_page_lets_go_of_the_wheel() {
          document.dispatchEvent(new Event('visibilitychange')); true",
     );
     let mut guest = common::page::Page::open(served.port);
-    let began = Instant::now();
-    let stopped = loop {
-        let frame = guest.next().unwrap();
-        if frame.number("speed_mph") == 0.0 {
-            break frame;
-        }
-        assert!(began.elapsed() < common::double::SILENCE, "{}", frame.state);
-    };
+    let stopped = guest.until_it_stands();
     assert!(stopped.state["manual"]["driver"].is_null(), "{}", stopped.state);
     browser.value("delete document.hidden; document.dispatchEvent(new Event('visibilitychange')); true");
     browser.wait_for("document.getElementById('link').textContent === 'you drive'");

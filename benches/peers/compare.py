@@ -121,6 +121,18 @@ def summarise(rounds, row):
     return cells, f"{statistics.median(ratios):.2f} x"
 
 
+def table(results, versions, args, rounds_done):
+    """The table as Markdown, of the rounds that are done."""
+    lines = [f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores; {', '.join(versions)}; "
+             f"batch {args.batch}, {args.threads} threads, one image on 1 thread; {rounds_done} rounds", ""]  # fmt: skip
+    lines += ["| | | median (lowest-highest) | against the best peer |", "|---|---|---|---|"]
+    for network, rounds in results.items():
+        for row in rounds[0]:
+            cells, ratio = summarise(rounds, row)
+            lines.append(f"| {network} | {row} | {', '.join(cells)} | {ratio} |")
+    return "\n".join(lines)
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--networks", nargs="+", choices=NETWORKS, default=NETWORKS)
@@ -141,18 +153,11 @@ def main():
                 print(f"round {number + 1}/{args.rounds}: {network}", file=sys.stderr, flush=True)
                 measured, versions = measure_round(ours, network, onnx[network], args)
                 results.setdefault(network, []).append(measured)
-
-    lines = [f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores; {', '.join(versions)}; "
-             f"batch {args.batch}, {args.threads} threads, one image on 1 thread; {args.rounds} rounds", ""]  # fmt: skip
-    lines += ["| | | median (lowest-highest) | against the best peer |", "|---|---|---|---|"]
-    for network, rounds in results.items():
-        for row in rounds[0]:
-            cells, ratio = summarise(rounds, row)
-            lines.append(f"| {network} | {row} | {', '.join(cells)} | {ratio} |")
-    text = "\n".join(lines)
+            text = table(results, versions, args, number + 1)
+            if args.markdown:
+                # Kept after every round, in case there is no time for all of them.
+                args.markdown.write_text(text + "\n", encoding="utf-8")
     print(text)
-    if args.markdown:
-        args.markdown.write_text(text + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ use serde::Serialize;
 
 use super::share_bar::ShareBar;
 use super::video::tell_video;
-use super::{pool, print_json, stop_on_ctrl_c};
+use super::{pool, print, print_json, stop_on_ctrl_c};
 use crate::dataset::held_out::trained_on_held_out;
 use crate::error::{Error, Result};
 use crate::live::messages::Hello;
@@ -144,17 +144,17 @@ pub fn run(args: DriveArgs) -> Result<()> {
         print_json(&Report { summary: &result.summary, against, comparison })?;
         return saved.and(filmed);
     }
-    print_summary(&args.model, &result.summary);
+    let mut text = summary_text(&args.model, &result.summary);
     if let (Some(other), Some(name)) = (&other, &args.against) {
-        println!();
-        print_summary(name, &other.summary);
-        println!("\nA is {}, B is {name}; p: how often chance alone differs as much", args.model);
+        text += &format!("\n{}", summary_text(name, &other.summary));
+        text += &format!("\nA is {}, B is {name}; p: how often chance alone differs as much\n", args.model);
         for test in comparison {
             let verdict = if test.significant() { "more than chance" } else { "may be chance" };
             let PairedTest { measure, mean_a, mean_b, p_value } = &test;
-            println!("{measure:<45} A {mean_a:>8.3}  B {mean_b:>8.3}  p {p_value:.4}  {verdict}");
+            text += &format!("{measure:<45} A {mean_a:>8.3}  B {mean_b:>8.3}  p {p_value:.4}  {verdict}\n");
         }
     }
+    print(&text)?;
     saved.and(video.map_or(Ok(()), film))
 }
 
@@ -260,24 +260,41 @@ impl Wheel {
     }
 }
 
-fn print_summary(model: &str, s: &DriveSummary) {
+fn summary_text(model: &str, s: &DriveSummary) -> String {
     let held_out = if s.held_out { " (held out)" } else { "" };
-    println!("{model} on {}{held_out}, {} runs", s.track, s.runs);
-    if !s.trained_on_held_out.is_empty() {
-        println!("note: {model} was {}", trained_on_held_out(&s.trained_on_held_out));
-    }
+    let note = match s.trained_on_held_out.is_empty() {
+        true => String::new(),
+        false => format!("note: {model} was {}\n", trained_on_held_out(&s.trained_on_held_out)),
+    };
     let (low, high) = (100.0 * s.completed_low, 100.0 * s.completed_high);
-    println!(
-        "laps completed             {}/{} (whole runs: {low:.0} to {high:.0} %, 95 %)",
-        s.laps_completed, s.laps_total
-    );
-    println!("autonomy                   {:.1} %", s.autonomy_percent);
-    println!("interventions              {} ({:.2} a km)", s.interventions, s.interventions_per_km);
-    println!("distance driven            {:.0} m", s.distance_m);
-    println!("cross-track mean/RMS/p95   {:.2} / {:.2} / {:.2} m", s.cte_mean_m, s.cte_rms_m, s.cte_p95_m);
-    println!("off the road               {:.1} s", s.off_road_s);
-    println!("crashes                    {}", s.crashes);
-    println!("mean speed                 {:.1} mph", s.mean_speed_mph);
-    println!("whiteness                  {:.1} deg/s (expert {:.1})", s.whiteness_deg_s, s.expert_whiteness_deg_s);
-    println!("real-time factor           {:.1}", s.realtime_factor);
+    format!(
+        "{model} on {}{held_out}, {} runs\n{note}\
+         laps completed             {}/{} (whole runs: {low:.0} to {high:.0} %, 95 %)\n\
+         autonomy                   {:.1} %\n\
+         interventions              {} ({:.2} a km)\n\
+         distance driven            {:.0} m\n\
+         cross-track mean/RMS/p95   {:.2} / {:.2} / {:.2} m\n\
+         off the road               {:.1} s\n\
+         crashes                    {}\n\
+         mean speed                 {:.1} mph\n\
+         whiteness                  {:.1} deg/s (expert {:.1})\n\
+         real-time factor           {:.1}\n",
+        s.track,
+        s.runs,
+        s.laps_completed,
+        s.laps_total,
+        s.autonomy_percent,
+        s.interventions,
+        s.interventions_per_km,
+        s.distance_m,
+        s.cte_mean_m,
+        s.cte_rms_m,
+        s.cte_p95_m,
+        s.off_road_s,
+        s.crashes,
+        s.mean_speed_mph,
+        s.whiteness_deg_s,
+        s.expert_whiteness_deg_s,
+        s.realtime_factor
+    )
 }

@@ -12,6 +12,7 @@ use crate::error::{Error, Result};
 use crate::pilot::Pilot;
 use crate::report::video::replay::{self, Choice};
 use crate::report::video::{Onlooker, VideoSummary, recording};
+use crate::simulator::trajectory::{RUN_DEPTH, find_drives, is_drive};
 
 /// Write a recording or a saved drive as a video that browsers and VLC play
 #[derive(Debug, Args)]
@@ -53,8 +54,8 @@ pub fn run(args: VideoArgs) -> Result<()> {
         Some(model) => Some(Onlooker::new(Pilot::load(model)?, args.saliency)?),
         None => None,
     };
-    let is_drive = replay::is_drive(&args.source);
-    let below = if is_drive { Vec::new() } else { replay::drives_below(&args.source) };
+    let is_drive = is_drive(&args.source);
+    let below = if is_drive { Vec::new() } else { find_drives(&args.source, RUN_DEPTH) };
     if !below.is_empty() {
         let names: Vec<String> = below.iter().map(|path| path.display().to_string()).collect();
         let message = format!("holds drives and is none itself; name one of {}", names.join(", "));

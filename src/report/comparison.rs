@@ -9,15 +9,13 @@ use super::map::{self, Place};
 use super::palette;
 use crate::error::{Error, Result};
 use crate::recipe::Recipe;
-use crate::simulator::trajectory::{Waypoint, read_trajectory};
+use crate::simulator::trajectory::{RUN_DEPTH, Waypoint, find_drives, read_summary, read_trajectory, trajectories};
 use crate::simulator::{DriveSummary, Track};
 use crate::training::{EpochRecord, RunFolder, TrainResult};
 use steersman_kernels::Isa;
 
 /// Two charts side by side.
 const HALF: [f64; 2] = [552.0, 360.0];
-/// How deep drives are looked for below a run folder.
-const DEPTH: usize = 2;
 
 /// A run, read from its folder.
 #[derive(Debug)]
@@ -47,9 +45,9 @@ pub fn read(folders: &[PathBuf]) -> Result<Vec<RunView>> {
     let names = names(folders);
     let read = |(path, name): (&PathBuf, String)| {
         let folder = RunFolder::open(path)?;
-        let mut drives = Vec::new();
-        find_drives(path, DEPTH, &mut drives)?;
-        drives.sort_by(|a: &DriveView, b| a.summary.track.cmp(&b.summary.track));
+        let mut drives: Vec<DriveView> =
+            find_drives(path, RUN_DEPTH).iter().map(|folder| read_drive(folder)).collect::<Result<_>>()?;
+        drives.sort_by(|a, b| a.summary.track.cmp(&b.summary.track));
         Ok(RunView {
             name,
             recipe: folder.recipe()?,
@@ -70,25 +68,11 @@ fn names(folders: &[PathBuf]) -> Vec<String> {
     if differ { short } else { folders.iter().map(|path| path.display().to_string()).collect() }
 }
 
-/// Finds folders with a `summary.json` of a drive.
-fn find_drives(folder: &Path, depth: usize, drives: &mut Vec<DriveView>) -> Result<()> {
-    let mut entries: Vec<PathBuf> =
-        std::fs::read_dir(folder).map_err(Error::io(folder))?.flatten().map(|entry| entry.path()).collect();
-    entries.sort();
-    if let Ok(text) = std::fs::read_to_string(folder.join("summary.json")) {
-        let path = folder.join("summary.json");
-        let summary = serde_json::from_str(&text).map_err(|e| Error::data_at(&path, e.line() as u64, e.to_string()))?;
-        let is_way = |path: &&PathBuf| {
-            let name = path.file_name().unwrap_or_default().to_string_lossy();
-            name.starts_with("assisted_") && name.ends_with(".csv")
-        };
-        let ways = entries.iter().filter(is_way).map(|path| read_way(path)).collect::<Result<_>>()?;
-        drives.push(DriveView { summary, ways });
-    }
-    if depth > 0 {
-        entries.iter().filter(|path| path.is_dir()).try_for_each(|path| find_drives(path, depth - 1, drives))?;
-    }
-    Ok(())
+/// Reads the drive in `folder`.
+fn read_drive(folder: &Path) -> Result<DriveView> {
+    let assisted = trajectories(folder).into_iter().filter(|(kind, ..)| kind == "assisted");
+    let ways = assisted.map(|(_, _, path)| read_way(&path)).collect::<Result<_>>()?;
+    Ok(DriveView { summary: read_summary(folder)?, ways })
 }
 
 fn read_way(path: &Path) -> Result<Vec<Place>> {

@@ -11,7 +11,7 @@ use super::run::{Driver, Expert, INTERVENTION_M, Run, RunOptions, line_errors_m,
 use super::speed::Speed;
 use super::statistics::{PairedTest, wilson_interval};
 use super::track::Track;
-use super::trajectory::trajectory_csv;
+use super::trajectory::{SUMMARY, trajectory_csv};
 use crate::new_folder::NewFolder;
 use crate::{Error, Result};
 
@@ -315,7 +315,7 @@ pub fn write_trajectories(result: &DriveResult, folder: NewFolder) -> Result<()>
             written.map_err(|source| folder.explain(Error::Io { path, source }))?;
         }
     }
-    let path = folder.unfinished().join("summary.json");
+    let path = folder.unfinished().join(SUMMARY);
     let text = serde_json::to_string_pretty(&result.summary).map_err(|e| Error::data(&path, e.to_string()))?;
     std::fs::write(&path, text + "\n").map_err(|source| folder.explain(Error::Io { path, source }))?;
     folder.finish()

@@ -57,17 +57,14 @@ impl<'a> Simulation<'a> {
     /// A car at `start`, already moving at `speed_mps`.
     pub fn new(track: &'a Track, start: Start, speed_mps: f64) -> Simulation<'a> {
         let car = placed(track, start, speed_mps);
+        Simulation::with_car(track, car, start.reverse)
+    }
+
+    /// The moment before the first step.
+    fn with_car(track: &'a Track, car: Car, reverse: bool) -> Simulation<'a> {
         let location = track.locate(car.x, car.y);
-        let mut simulation = Simulation {
-            track,
-            car,
-            location,
-            reverse: start.reverse,
-            steps: 0,
-            progress_m: 0.0,
-            wheels_off: 0,
-            at_wall: false,
-        };
+        let mut simulation =
+            Simulation { track, car, location, reverse, steps: 0, progress_m: 0.0, wheels_off: 0, at_wall: false };
         simulation.feel();
         simulation
     }
@@ -97,18 +94,8 @@ impl<'a> Simulation<'a> {
     pub fn posed(track: &'a Track, [x, y]: [f64; 2], heading_deg: f64, speed_mps: f64) -> Simulation<'a> {
         let (hy, hx) = sin_cos(heading_deg.to_radians());
         let location = track.locate(x, y);
-        let mut simulation = Simulation {
-            track,
-            car: Car::new(x, y, hx, hy, speed_mps),
-            location,
-            reverse: hx * location.tx + hy * location.ty < 0.0,
-            steps: 0,
-            progress_m: 0.0,
-            wheels_off: 0,
-            at_wall: false,
-        };
-        simulation.feel();
-        simulation
+        let reverse = hx * location.tx + hy * location.ty < 0.0;
+        Simulation::with_car(track, Car::new(x, y, hx, hy, speed_mps), reverse)
     }
 
     /// Takes the car to where a trajectory leads, counting the way and one step of time; otherwise as

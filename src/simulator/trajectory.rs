@@ -1,12 +1,19 @@
 //! The way of a run as a file, and read again.
 
 use std::fmt::Write as _;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
+use super::drive::DriveSummary;
 use super::run::Run;
 use crate::{Error, Result};
+
+/// How deep drives lie below the folder of a training run: `drives/NAME`.
+pub const RUN_DEPTH: usize = 2;
+
+/// File in the folder of a drive that holds what was measured.
+pub(super) const SUMMARY: &str = "summary.json";
 
 /// A run as CSV text, one line for each frame.
 pub fn trajectory_csv(run: &Run) -> String {
@@ -50,6 +57,49 @@ pub struct Waypoint {
     pub intervention: u8,
     /// Where the car points: deg, anticlockwise from east. Older files do not tell.
     pub heading_deg: Option<f64>,
+}
+
+/// The trajectories in the folder of a drive: `free` or `assisted`, seed, file; in the order of the seeds.
+pub fn trajectories(folder: &Path) -> Vec<(String, u64, PathBuf)> {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
+    let mut found: Vec<_> = entries
+        .filter_map(|path| {
+            let (kind, seed) = path.file_name()?.to_str()?.strip_suffix(".csv")?.split_once('_')?;
+            let known = ["free", "assisted"].contains(&kind);
+            known.then_some(()).and(Some((kind.to_string(), seed.parse().ok()?, path.clone())))
+        })
+        .collect();
+    found.sort_by_key(|(_, seed, _)| *seed);
+    found
+}
+
+/// Whether `path` is a folder that `drive --out` wrote.
+pub fn is_drive(path: &Path) -> bool {
+    path.join(SUMMARY).is_file() && !trajectories(path).is_empty()
+}
+
+/// Folders of drives at `folder` and at most `depth` folders below it, in the order of their names.
+pub fn find_drives(folder: &Path, depth: usize) -> Vec<PathBuf> {
+    if is_drive(folder) {
+        return vec![folder.to_path_buf()];
+    }
+    if depth == 0 {
+        return Vec::new();
+    }
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
+    let mut folders: Vec<PathBuf> = entries.filter(|path| path.is_dir()).collect();
+    folders.sort();
+    folders.iter().flat_map(|folder| find_drives(folder, depth - 1)).collect()
+}
+
+/// Reads the summary of the drive in `folder`.
+///
+/// # Errors
+/// [`Error::Io`] if it cannot be read, [`Error::Data`] with the line that is not as it must be.
+pub fn read_summary(folder: &Path) -> Result<DriveSummary> {
+    let path = folder.join(SUMMARY);
+    let text = std::fs::read_to_string(&path).map_err(Error::io(&path))?;
+    serde_json::from_str(&text).map_err(|e| Error::data_at(&path, e.line() as u64, e.to_string()))
 }
 
 /// Reads the trajectory `path`.

@@ -1,5 +1,5 @@
-//! What several tests share. Not every test uses all of it.
-#![allow(dead_code)]
+//! What several tests share.
+#![allow(dead_code)] // Each test is a crate of its own and would warn of what only others use.
 
 pub mod browser;
 pub mod command;

@@ -89,6 +89,18 @@ impl Page {
         }
     }
 
+    /// Looks on until the car stands.
+    pub fn until_it_stands(&mut self) -> Frame {
+        let began = Instant::now();
+        loop {
+            let frame = self.next().unwrap();
+            if frame.number("speed_mph") == 0.0 {
+                return frame;
+            }
+            assert!(began.elapsed() < SILENCE, "it does not stop: {}", frame.state);
+        }
+    }
+
     /// Holds keys until a frame is as wanted.
     pub fn hold_until(&mut self, steer: i32, pedal: i32, wanted: impl Fn(&Frame) -> bool) -> Frame {
         let began = Instant::now();

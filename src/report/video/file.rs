@@ -17,7 +17,7 @@ use crate::error::{Error, Result};
 const TICKS_PER_S: u32 = 90_000;
 /// Seconds between pictures that stand alone, to which a player can jump.
 const KEY_S: f64 = 2.0;
-/// Quantizer, 0 (best) to 51: text stays crisp, and two minutes of the simulator take about 18 MB.
+/// Quantizer, 0 (best) to 51: text stays crisp, and two minutes of the simulator take 15 to 18 MB.
 const QUANTIZER: u8 = 29;
 /// H.264 level 3.1: up to 1280x720 pixels 30 times a second.
 const LEVEL_IDC: u8 = 31;

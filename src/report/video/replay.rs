@@ -10,8 +10,8 @@ use crate::report::lettering::end_of;
 use crate::simulator::car::{MAX_STEER_DEG, MPS_PER_MPH};
 use crate::simulator::eye::Eye;
 use crate::simulator::run::DRIVE_HZ;
-use crate::simulator::trajectory::{Waypoint, read_trajectory};
-use crate::simulator::{DriveSummary, HEIGHT, Simulation, Track, WIDTH, expert};
+use crate::simulator::trajectory::{Waypoint, read_summary, read_trajectory, trajectories};
+use crate::simulator::{HEIGHT, Simulation, Track, WIDTH, expert};
 
 /// Which run of a drive, and how.
 #[derive(Clone, Copy, Debug, Default)]
@@ -20,11 +20,6 @@ pub struct Choice {
     pub seed: Option<u64>,
     /// The run in which the car was put back, instead of the one in which nobody helped.
     pub assisted: bool,
-}
-
-/// Whether `path` is a folder that `drive --out` wrote.
-pub fn is_drive(path: &Path) -> bool {
-    path.join("summary.json").is_file() && !trajectories(path).is_empty()
 }
 
 /// Writes the video of a run of the drive in `folder` to the new file `out`. What steered is drawn as it was saved; an
@@ -44,7 +39,7 @@ pub fn film(
     progress: &mut dyn FnMut(f64) -> bool,
 ) -> Result<(VideoSummary, bool)> {
     let (seed, path) = choose(folder, choice)?;
-    let track = Track::load(&summary(folder)?.track)?;
+    let track = Track::load(&read_summary(folder)?.track)?;
     let way = read_trajectory(&path)?;
     let poses: Vec<f64> = way.iter().map_while(|waypoint| waypoint.heading_deg).collect();
     if poses.len() < way.len() {
@@ -95,43 +90,6 @@ pub fn film(
         (false, times) => format!("{:.1} s, put back {times} times", scene.time_s),
     };
     Ok((video.finish(&text)?, stopped))
-}
-
-/// Folders of drives in `folder` and below, as training runs keep them.
-pub fn drives_below(folder: &Path) -> Vec<PathBuf> {
-    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
-    let mut folders: Vec<PathBuf> = entries.filter(|path| path.is_dir()).collect();
-    folders.sort();
-    let found = |path: PathBuf| if is_drive(&path) { vec![path] } else { drives_in(&path) };
-    folders.into_iter().flat_map(found).collect()
-}
-
-/// Folders of drives directly in `folder`.
-fn drives_in(folder: &Path) -> Vec<PathBuf> {
-    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
-    let mut found: Vec<PathBuf> = entries.filter(|path| is_drive(path)).collect();
-    found.sort();
-    found
-}
-
-fn summary(folder: &Path) -> Result<DriveSummary> {
-    let path = folder.join("summary.json");
-    let text = std::fs::read_to_string(&path).map_err(Error::io(&path))?;
-    serde_json::from_str(&text).map_err(|e| Error::data_at(&path, e.line() as u64, e.to_string()))
-}
-
-/// The trajectories in a folder: kind, seed, file; in the order of the seeds.
-fn trajectories(folder: &Path) -> Vec<(String, u64, PathBuf)> {
-    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
-    let mut found: Vec<_> = entries
-        .filter_map(|path| {
-            let (kind, seed) = path.file_name()?.to_str()?.strip_suffix(".csv")?.split_once('_')?;
-            let known = ["free", "assisted"].contains(&kind);
-            known.then_some(()).and(Some((kind.to_string(), seed.parse().ok()?, path.clone())))
-        })
-        .collect();
-    found.sort_by_key(|(_, seed, _)| *seed);
-    found
 }
 
 fn choose(folder: &Path, choice: Choice) -> Result<(u64, PathBuf)> {

@@ -1,225 +1,10 @@
-//! Batch normalisation, a rectifier and, where it follows, maximum pooling of 2x2 windows, in one pass.
-//!
-//! `y = pool(f(x scale[c] + shift[c]))`. Only `x` and `y` are kept. The gradient is found from `x` again: the largest
-//! of a window is looked for a second time, which costs less than reading what was written for it.
-//!
-//! In the gradient, `z` is the normalised value that goes into the rectifier and `dz` its gradient. It is taken in two
-//! passes over `x`, with the whole batch between them: [`backward_sums`] and [`backward`], which puts the gradient of `x`
-//! in the place of `x`.
+//! The gradient, in two passes over `x`.
 
+use super::{ChannelMeans, ChannelStatistics, RectifyShape, Slopes};
 use crate::simd::{Simd, get, get_pairs, put, put_pairs};
-
-/// What follows the normalisation of `[n][c][h][w]` maps.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct RectifyShape {
-    /// Channels.
-    pub c: usize,
-    /// Height before pooling.
-    pub h: usize,
-    /// Width before pooling.
-    pub w: usize,
-    /// Whether the maximum of 2x2 windows, 2 apart, is taken; a last odd row or column is left out.
-    pub pooled: bool,
-}
-
-impl RectifyShape {
-    /// Elements of an image before pooling.
-    fn x_len(&self) -> usize {
-        self.c * self.h * self.w
-    }
-
-    /// Elements of a channel after pooling.
-    fn y_plane(&self) -> usize {
-        if self.pooled { (self.h / 2) * (self.w / 2) } else { self.h * self.w }
-    }
-
-    fn check(&self, kernel: &str, n: usize, x: usize, y: usize, statistics: &[&[f32]], slopes: Slopes) {
-        assert_eq!(x, n * self.x_len(), "{kernel}: input length for {n} of {self:?}");
-        assert_eq!(y, n * self.c * self.y_plane(), "{kernel}: output length for {n} of {self:?}");
-        assert!(statistics.iter().all(|s| s.len() == self.c), "{kernel}: a statistic is not c long");
-        let fits = match slopes {
-            Slopes::Zero => true,
-            Slopes::PerChannel(slopes) => slopes.len() == self.c,
-            Slopes::PerPosition(slopes) => slopes.len() == self.x_len(),
-        };
-        assert!(fits, "{kernel}: wrong number of slopes for {self:?}");
-    }
-}
-
-/// What a rectifier multiplies values at or below 0 by.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Slopes<'a> {
-    /// ReLU: the result is 0.
-    Zero,
-    /// PReLU with one slope a channel.
-    PerChannel(&'a [f32]),
-    /// PReLU with one slope an element of the image.
-    PerPosition(&'a [f32]),
-}
-
-impl<'a> Slopes<'a> {
-    /// How many slopes there are.
-    fn len(self) -> usize {
-        match self {
-            Slopes::Zero => 0,
-            Slopes::PerChannel(slopes) | Slopes::PerPosition(slopes) => slopes.len(),
-        }
-    }
-
-    /// The slope of `channel`, where it has a single one.
-    fn single(self, channel: usize) -> f32 {
-        if let Slopes::PerChannel(slopes) = self { slopes[channel] } else { 0.0 }
-    }
-
-    /// The slopes of a range of elements of the image, where each has its own.
-    fn each(self, range: std::ops::Range<usize>) -> &'a [f32] {
-        if let Slopes::PerPosition(slopes) = self { &slopes[range] } else { &[] }
-    }
-
-    /// The slopes of the rows `rows` of `w` elements of `channel`.
-    #[inline(always)]
-    fn of(self, shape: &RectifyShape, channel: usize, rows: std::ops::Range<usize>) -> Slopes<'a> {
-        match self {
-            Slopes::Zero => Slopes::Zero,
-            Slopes::PerChannel(slopes) => Slopes::PerChannel(&slopes[channel..=channel]),
-            Slopes::PerPosition(slopes) => {
-                let row = channel * shape.h;
-                Slopes::PerPosition(&slopes[(row + rows.start) * shape.w..(row + rows.end) * shape.w])
-            }
-        }
-    }
-}
-
-/// What batch normalisation knows of each channel, for the gradient: `[c]` each.
-#[derive(Clone, Copy, Debug)]
-pub struct ChannelStatistics<'a> {
-    /// Mean of `x` over the batch.
-    pub mean: &'a [f32],
-    /// One over the deviation of `x`.
-    pub inv_std: &'a [f32],
-    /// `z = x scale + shift`.
-    pub scale: &'a [f32],
-    /// See `scale`.
-    pub shift: &'a [f32],
-}
-
-/// What the batch says of the gradient of each channel: `[c]` each.
-#[derive(Clone, Copy, Debug)]
-pub struct ChannelMeans<'a> {
-    /// Mean of `dz`.
-    pub dz: &'a [f32],
-    /// Mean of `dz` times the normalised `x`.
-    pub dz_xhat: &'a [f32],
-    /// `gamma inv_std`.
-    pub gain: &'a [f32],
-}
 
 /// Elements that are summed in single precision before their sum is added up in double.
 const STRIP: usize = 512;
-
-per_isa! {
-    /// `y = pool(f(x scale[c] + shift[c]))`; `y` is overwritten.
-    ///
-    /// # Shapes
-    /// `x`: `[n][c][h][w]`, `y` the same or, if pooled, `[n][c][h / 2][w / 2]`.
-    ///
-    /// # Panics
-    /// If a slice has another length.
-    pub fn forward<S>(
-        _simd: S,
-        shape: &RectifyShape,
-        n: usize,
-        x: &[f32],
-        scale: &[f32],
-        shift: &[f32],
-        slopes: Slopes,
-        y: &mut [f32],
-    ) {
-        shape.check("norm_rectify forward", n, x.len(), y.len(), &[scale, shift], slopes);
-        let &RectifyShape { c, h, w, pooled } = shape;
-        if y.is_empty() {
-            return;
-        }
-        for (plane, (x, y)) in x.chunks_exact(h * w).zip(y.chunks_exact_mut(shape.y_plane())).enumerate() {
-            let channel = plane % c;
-            let (scale, shift) = (scale[channel], shift[channel]);
-            if !pooled {
-                forward_row(x, scale, shift, slopes.of(shape, channel, 0..h), y);
-                continue;
-            }
-            for (row, (x, y)) in x.chunks_exact(2 * w).zip(y.chunks_exact_mut(w / 2)).enumerate() {
-                forward_windows(x, w, scale, shift, slopes.of(shape, channel, 2 * row..2 * row + 2), y);
-            }
-        }
-    }
-}
-
-#[inline(always)]
-fn relu(z: f32, _slope: f32) -> f32 {
-    if z > 0.0 { z } else { 0.0 }
-}
-
-#[inline(always)]
-fn prelu(z: f32, slope: f32) -> f32 {
-    if z > 0.0 { z } else { slope * z }
-}
-
-#[inline(always)]
-fn forward_row(x: &[f32], scale: f32, shift: f32, slopes: Slopes, y: &mut [f32]) {
-    match slopes {
-        Slopes::Zero => y.iter_mut().zip(x).for_each(|(y, x)| *y = relu(x * scale + shift, 0.0)),
-        Slopes::PerChannel(slope) => {
-            let slope = slope[0];
-            y.iter_mut().zip(x).for_each(|(y, x)| *y = prelu(x * scale + shift, slope));
-        }
-        Slopes::PerPosition(slopes) => {
-            y.iter_mut().zip(x).zip(slopes).for_each(|((y, x), slope)| *y = prelu(x * scale + shift, *slope));
-        }
-    }
-}
-
-/// One row of windows from the two rows in `x`.
-#[inline(always)]
-fn forward_windows(x: &[f32], w: usize, scale: f32, shift: f32, slopes: Slopes, y: &mut [f32]) {
-    let (above, below) = x.split_at(w);
-    let windows = above.as_chunks::<2>().0.iter().zip(below.as_chunks::<2>().0);
-    // Written out: a closure might not be inlined into the function with the instruction set.
-    match slopes {
-        // This does not fall, so the largest can be taken first.
-        Slopes::Zero => {
-            for (y, (a, b)) in y.iter_mut().zip(windows) {
-                let (z0, z1) = (a[0] * scale + shift, a[1] * scale + shift);
-                let (z2, z3) = (b[0] * scale + shift, b[1] * scale + shift);
-                *y = relu(largest(z0, z1, z2, z3), 0.0);
-            }
-        }
-        Slopes::PerChannel(slope) => {
-            let slope = slope[0];
-            for (y, (a, b)) in y.iter_mut().zip(windows) {
-                let (f0, f1) = (prelu(a[0] * scale + shift, slope), prelu(a[1] * scale + shift, slope));
-                let (f2, f3) = (prelu(b[0] * scale + shift, slope), prelu(b[1] * scale + shift, slope));
-                *y = largest(f0, f1, f2, f3);
-            }
-        }
-        Slopes::PerPosition(slopes) => {
-            let (s_above, s_below) = slopes.split_at(w);
-            let slopes = s_above.as_chunks::<2>().0.iter().zip(s_below.as_chunks::<2>().0);
-            for ((y, (a, b)), (s, t)) in y.iter_mut().zip(windows).zip(slopes) {
-                let (f0, f1) = (prelu(a[0] * scale + shift, s[0]), prelu(a[1] * scale + shift, s[1]));
-                let (f2, f3) = (prelu(b[0] * scale + shift, t[0]), prelu(b[1] * scale + shift, t[1]));
-                *y = largest(f0, f1, f2, f3);
-            }
-        }
-    }
-}
-
-/// The largest of a window.
-#[inline(always)]
-fn largest(a: f32, b: f32, c: f32, d: f32) -> f32 {
-    let above = if a > b { a } else { b };
-    let below = if c > d { c } else { d };
-    if above > below { above } else { below }
-}
 
 /// How the slopes of a row are found: none, one for all, or a list.
 const ZERO: u8 = 0;
@@ -500,7 +285,7 @@ per_isa! {
     /// `x` to `sums[c..]`, and the gradient of the slopes to `dslopes`, as long as the slopes.
     ///
     /// # Shapes
-    /// As for [`forward`], `dy` like `y`.
+    /// As for [`forward`](super::forward()), `dy` like `y`.
     ///
     /// # Panics
     /// If a slice has another length.
@@ -581,7 +366,7 @@ per_isa! {
     /// of `x`. The means are those of the batch; `gain` is `gamma inv_std`.
     ///
     /// # Shapes
-    /// As for [`forward`], `dy` like `y`.
+    /// As for [`forward`](super::forward()), `dy` like `y`.
     ///
     /// # Panics
     /// If a slice has another length.
