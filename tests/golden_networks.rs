@@ -142,7 +142,7 @@ impl LayerByLayer {
             }
             let mut y = vec![f32::NAN; n * layer.output().len()];
             let mut scratch = vec![f32::NAN; layer.scratch_len(n)];
-            let pass = Pass { seed: 0, step: 0, layer: index, first_image: 0, moments: &moments };
+            let pass = Pass { seed: 0, step: 0, layer: index, first_image: 0, moments: &moments, prepared: &[] };
             layer.forward(params, &pass, n, x, &mut y, &mut scratch);
             outputs.push(y);
             all_moments.push(moments);
@@ -163,7 +163,7 @@ impl LayerByLayer {
             }
             let mut dx = vec![f32::NAN; x.len()];
             let mut scratch = vec![f32::NAN; layer.scratch_len(n)];
-            let pass = Pass { seed: 0, step: 0, layer: index, first_image: 0, moments };
+            let pass = Pass { seed: 0, step: 0, layer: index, first_image: 0, moments, prepared: &[] };
             let pair = Pair { x, y: &outputs[index], dy: &dy };
             layer.backward(params, &pass, n, pair, Some(&mut dx), Grads { dparams, scratch: &mut scratch });
             dy = dx;

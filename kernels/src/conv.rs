@@ -16,6 +16,7 @@ mod prepare;
 mod shape;
 mod sparse;
 mod weight_gradient;
+mod winograd;
 
 use crate::Isa;
 use direct::{Band, TapSum};
@@ -43,6 +44,10 @@ pub struct Conv {
     layout: Layout,
     sum: TapSum,
     input_gradient: InputGradient,
+    /// The passes that gain by minimal filtering.
+    fast_forward: Option<winograd::Forward>,
+    fast_input_gradient: Option<winograd::InputGradient>,
+    fast_weight_gradient: Option<winograd::WeightGradient>,
 }
 
 impl Conv {
@@ -71,7 +76,18 @@ impl Conv {
             plane: shape.out_pixels(),
         };
         let input_gradient = InputGradient::new(shape, isa);
-        Conv { shape, isa, layout, sum, input_gradient }
+        let fast_input_gradient =
+            if input_gradient.by_product() { None } else { winograd::InputGradient::new(shape) };
+        Conv {
+            shape,
+            isa,
+            layout,
+            sum,
+            input_gradient,
+            fast_forward: winograd::Forward::new(shape),
+            fast_input_gradient,
+            fast_weight_gradient: winograd::WeightGradient::new(shape),
+        }
     }
 
     /// The sizes.
@@ -86,9 +102,20 @@ impl Conv {
 
     /// Elements of `scratch` that are enough for every pass, whatever the number of images.
     pub fn scratch_len(&self) -> usize {
-        let weight_gradient = self.copy_len(GRADIENT_COPIES) + weight_gradient::scratch_len(self.shape.taps());
-        let forward = self.copy_len(FORWARD_COPIES) + self.sum.packed_len();
-        forward.max(weight_gradient).max(self.input_gradient.scratch_len())
+        let forward = self.forward_scratch_len() + self.packed_len();
+        let input_gradient = match &self.fast_input_gradient {
+            Some(fast) => fast.scratch_len(),
+            None => self.input_gradient.scratch_len(),
+        };
+        let weight_gradient = match &self.fast_weight_gradient {
+            Some(fast) => fast.scratch_len(),
+            None => self.copy_len(GRADIENT_COPIES) + weight_gradient::scratch_len(self.shape.taps()),
+        };
+        forward.max(weight_gradient).max(input_gradient + self.packed_gradient_len())
+    }
+
+    fn forward_scratch_len(&self) -> usize {
+        self.fast_forward.as_ref().map_or_else(|| self.copy_len(FORWARD_COPIES), winograd::Forward::scratch_len)
     }
 
     /// Elements of the copied images of a group.
@@ -124,7 +151,7 @@ impl Conv {
 
     /// Elements that the weights and bias of [`Conv::pack`] take.
     pub fn packed_len(&self) -> usize {
-        self.sum.packed_len()
+        self.fast_forward.as_ref().map_or_else(|| self.sum.packed_len(), winograd::Forward::packed_len)
     }
 
     /// Puts weights and bias in the order in which [`Conv::forward_packed`] reads them.
@@ -153,8 +180,10 @@ impl Conv {
         let shape = &self.shape;
         assert_eq!(x.len(), n * shape.x_len(), "conv forward: length of the {n} inputs of {shape:?}");
         assert_eq!(y.len(), n * shape.y_len(), "conv forward: length of the {n} outputs of {shape:?}");
-        if !y.is_empty() {
-            forward(self.isa, self, x, packed, y, scratch);
+        match &self.fast_forward {
+            _ if y.is_empty() => {}
+            Some(fast) => fast_forward(self.isa, fast, x, packed, y, scratch),
+            None => forward(self.isa, self, x, packed, y, scratch),
         }
     }
 
@@ -166,10 +195,51 @@ impl Conv {
     /// # Panics
     /// If a slice has another length, or `scratch` less than [`Conv::scratch_len`].
     pub fn backward_input(&self, n: usize, dy: &[f32], weight: &[f32], dx: &mut [f32], scratch: &mut [f32]) {
-        if self.check("conv backward_input", n, dx.len(), dy.len(), weight.len(), scratch.len()) && !dx.is_empty() {
-            input_gradient::run(self.isa, &self.input_gradient, dy, weight, dx, scratch);
-        } else {
+        assert!(scratch.len() >= self.scratch_len(), "conv backward_input: scratch must have {} elements", self.scratch_len());
+        let (packed, scratch) = scratch.split_at_mut(self.packed_gradient_len());
+        self.pack_gradient(weight, packed);
+        self.run_packed_gradient(n, dy, packed, dx, scratch);
+    }
+
+    /// Elements that the weights of [`Conv::pack_gradient`] take.
+    pub fn packed_gradient_len(&self) -> usize {
+        match &self.fast_input_gradient {
+            Some(fast) => fast.packed_len(),
+            None => self.input_gradient.packed_len(),
+        }
+    }
+
+    /// Puts the weights in the order in which [`Conv::backward_input_packed`] reads them.
+    ///
+    /// # Panics
+    /// If a slice has another length; that of `packed` is [`Conv::packed_gradient_len`].
+    pub fn pack_gradient(&self, weight: &[f32], packed: &mut [f32]) {
+        let shape = &self.shape;
+        assert_eq!(weight.len(), shape.oc * shape.taps(), "conv pack_gradient: length of the weights of {shape:?}");
+        assert_eq!(packed.len(), self.packed_gradient_len(), "conv pack_gradient: length of the packed weights of {shape:?}");
+        pack_gradient(self.isa, self, weight, packed);
+    }
+
+    /// As [`Conv::backward_input`], with weights from [`Conv::pack_gradient`].
+    ///
+    /// # Panics
+    /// As [`Conv::backward_input`].
+    pub fn backward_input_packed(&self, n: usize, dy: &[f32], packed: &[f32], dx: &mut [f32], scratch: &mut [f32]) {
+        assert!(scratch.len() >= self.scratch_len(), "conv backward_input: scratch must have {} elements", self.scratch_len());
+        assert_eq!(packed.len(), self.packed_gradient_len(), "conv backward_input: length of the packed weights of {:?}", self.shape);
+        self.run_packed_gradient(n, dy, packed, dx, scratch);
+    }
+
+    fn run_packed_gradient(&self, n: usize, dy: &[f32], packed: &[f32], dx: &mut [f32], scratch: &mut [f32]) {
+        let shape = &self.shape;
+        assert_eq!(dx.len(), n * shape.x_len(), "conv backward_input: length of the {n} inputs of {shape:?}");
+        assert_eq!(dy.len(), n * shape.y_len(), "conv backward_input: length of the {n} outputs of {shape:?}");
+        if dy.is_empty() || dx.is_empty() {
             dx.fill(0.0);
+        } else if let Some(fast) = &self.fast_input_gradient {
+            fast_input_gradient(self.isa, fast, dy, packed, dx, scratch);
+        } else {
+            input_gradient::run(self.isa, &self.input_gradient, dy, packed, dx, scratch);
         }
     }
 
@@ -191,8 +261,10 @@ impl Conv {
     ) {
         let any = self.check("conv backward_weight", n, x.len(), dy.len(), dweight.len(), scratch.len());
         assert_eq!(dbias.len(), self.shape.oc, "conv backward_weight: length of the bias of {:?}", self.shape);
-        if any {
-            backward_weight(self.isa, self, x, dy, dweight, dbias, scratch);
+        match &self.fast_weight_gradient {
+            _ if !any => {}
+            Some(fast) => fast_weight_gradient(self.isa, fast, x, dy, dweight, dbias, scratch),
+            None => backward_weight(self.isa, self, x, dy, dweight, dbias, scratch),
         }
     }
 }
@@ -245,7 +317,59 @@ impl Conv {
 
 per_isa! {
     fn pack<S>(simd: S, conv: &Conv, weight: &[f32], bias: &[f32], packed: &mut [f32]) {
-        conv.sum.pack(simd, Some(bias), weight, packed);
+        match &conv.fast_forward {
+            Some(fast) => fast.pack(simd, weight, bias, packed),
+            None => conv.sum.pack(simd, Some(bias), weight, packed),
+        }
+    }
+}
+
+per_isa! {
+    fn pack_gradient<S>(simd: S, conv: &Conv, weight: &[f32], packed: &mut [f32]) {
+        match &conv.fast_input_gradient {
+            Some(fast) => fast.pack(simd, weight, packed),
+            None => conv.input_gradient.pack(simd, weight, packed),
+        }
+    }
+}
+
+per_isa! {
+    fn fast_forward<S>(
+        simd: S,
+        forward: &winograd::Forward,
+        x: &[f32],
+        packed: &[f32],
+        y: &mut [f32],
+        scratch: &mut [f32],
+    ) {
+        forward.run(simd, x, packed, y, scratch);
+    }
+}
+
+per_isa! {
+    fn fast_input_gradient<S>(
+        simd: S,
+        gradient: &winograd::InputGradient,
+        dy: &[f32],
+        packed: &[f32],
+        dx: &mut [f32],
+        scratch: &mut [f32],
+    ) {
+        gradient.run(simd, dy, packed, dx, scratch);
+    }
+}
+
+per_isa! {
+    fn fast_weight_gradient<S>(
+        simd: S,
+        gradient: &winograd::WeightGradient,
+        x: &[f32],
+        dy: &[f32],
+        dweight: &mut [f32],
+        dbias: &mut [f32],
+        scratch: &mut [f32],
+    ) {
+        gradient.run(simd, x, dy, dweight, dbias, scratch);
     }
 }
 

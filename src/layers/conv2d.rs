@@ -95,6 +95,11 @@ impl Conv2d {
         params.split_at(self.weight_len())
     }
 
+    /// What is prepared for the forward pass and for the input gradient, if anything is.
+    fn split_prepared<'a>(&self, prepared: &'a [f32]) -> Option<(&'a [f32], &'a [f32])> {
+        (!prepared.is_empty()).then(|| prepared.split_at(self.conv.packed_len()))
+    }
+
     fn weight_len(&self) -> usize {
         self.shape.oc * self.shape.c * self.shape.kh * self.shape.kw
     }
@@ -128,15 +133,18 @@ impl Layer for Conv2d {
         self.conv.forward(n, x, weight, bias, y, scratch);
     }
 
-    fn forward(&self, params: &[f32], _pass: &Pass, n: usize, x: &[f32], y: &mut [f32], scratch: &mut [f32]) {
-        self.infer(params, &[], n, x, y, scratch);
+    fn forward(&self, params: &[f32], pass: &Pass, n: usize, x: &[f32], y: &mut [f32], scratch: &mut [f32]) {
+        match self.split_prepared(pass.prepared) {
+            Some((prepared, _)) => self.conv.forward_packed(n, x, prepared, y, scratch),
+            None => self.infer(params, &[], n, x, y, scratch),
+        }
     }
 
-    fn backward(&self, params: &[f32], _pass: &Pass, n: usize, pair: Pair, dx: Option<&mut [f32]>, grads: Grads) {
+    fn backward(&self, params: &[f32], pass: &Pass, n: usize, pair: Pair, dx: Option<&mut [f32]>, grads: Grads) {
         let (dweight, dbias) = grads.dparams.split_at_mut(self.weight_len());
         self.conv.backward_weight(n, pair.x, pair.dy, dweight, dbias, grads.scratch);
         if let Some(dx) = dx {
-            self.backward_input(params, n, pair.dy, dx, grads.scratch);
+            self.backward_input(params, pass, n, pair.dy, dx, grads.scratch);
         }
     }
 
@@ -159,14 +167,28 @@ impl Prepared for Conv2d {
         self.conv.pack(weight, bias, prepared);
     }
 
+    fn prepared_for_training_len(&self) -> usize {
+        self.conv.packed_len() + self.conv.packed_gradient_len()
+    }
+
+    fn prepare_for_training(&self, params: &[f32], prepared: &mut [f32]) {
+        let (forward, gradient) = prepared.split_at_mut(self.conv.packed_len());
+        let (weight, bias) = self.split(params);
+        self.conv.pack(weight, bias, forward);
+        self.conv.pack_gradient(weight, gradient);
+    }
+
     fn infer_prepared(&self, prepared: &[f32], n: usize, x: &[f32], y: &mut [f32], scratch: &mut [f32]) {
         self.conv.forward_packed(n, x, prepared, y, scratch);
     }
 }
 
 impl Linear for Conv2d {
-    fn backward_input(&self, params: &[f32], n: usize, dy: &[f32], dx: &mut [f32], scratch: &mut [f32]) {
-        self.conv.backward_input(n, dy, &params[..self.weight_len()], dx, scratch);
+    fn backward_input(&self, params: &[f32], pass: &Pass, n: usize, dy: &[f32], dx: &mut [f32], scratch: &mut [f32]) {
+        match self.split_prepared(pass.prepared) {
+            Some((_, prepared)) => self.conv.backward_input_packed(n, dy, prepared, dx, scratch),
+            None => self.conv.backward_input(n, dy, &params[..self.weight_len()], dx, scratch),
+        }
     }
 }
 

@@ -70,7 +70,7 @@ impl Layer for Dense {
         self.infer(params, &[], n, x, y, scratch);
     }
 
-    fn backward(&self, params: &[f32], _pass: &Pass, n: usize, pair: Pair, dx: Option<&mut [f32]>, grads: Grads) {
+    fn backward(&self, params: &[f32], pass: &Pass, n: usize, pair: Pair, dx: Option<&mut [f32]>, grads: Grads) {
         let Pair { x, dy, .. } = pair;
         let Grads { dparams, scratch } = grads;
         let (inputs, units) = (self.inputs, self.units);
@@ -82,7 +82,7 @@ impl Layer for Dense {
             }
         }
         if let Some(dx) = dx {
-            self.backward_input(params, n, dy, dx, scratch);
+            self.backward_input(params, pass, n, dy, dx, scratch);
         }
     }
 
@@ -92,7 +92,7 @@ impl Layer for Dense {
 }
 
 impl Linear for Dense {
-    fn backward_input(&self, params: &[f32], n: usize, dy: &[f32], dx: &mut [f32], scratch: &mut [f32]) {
+    fn backward_input(&self, params: &[f32], _pass: &Pass, n: usize, dy: &[f32], dx: &mut [f32], scratch: &mut [f32]) {
         let (inputs, units) = (self.inputs, self.units);
         let weight = &params[..inputs * units];
         gemm(self.isa, n, units, inputs, 1.0, dy, (units, 1), weight, (inputs, 1), 0.0, dx, (inputs, 1), scratch);

@@ -76,7 +76,7 @@ mod tests {
     use super::*;
 
     fn pass(step: u64, layer: usize, first_image: usize) -> Pass<'static> {
-        Pass { seed: 1, step, layer, first_image, moments: &[] }
+        Pass { seed: 1, step, layer, first_image, moments: &[], prepared: &[] }
     }
 
     fn drop(layer: &Dropout, pass: &Pass, x: &[f32]) -> Vec<f32> {

@@ -110,6 +110,9 @@ pub struct Pass<'a> {
     pub first_image: usize,
     /// What [`BatchStatistics`] has put there for this layer; empty for all others.
     pub moments: &'a [f32],
+    /// What [`Prepared::prepare_for_training`] made of the layer's parameters at the start of the step. Empty if nobody asked it
+    /// to; then the layer does so in every call.
+    pub prepared: &'a [f32],
 }
 
 /// A layer whose input shape is known.
@@ -207,6 +210,12 @@ pub trait Prepared {
     /// Overwrites `prepared`.
     fn prepare(&self, params: &[f32], prepared: &mut [f32]);
 
+    /// How many numbers the parameters prepared for training are.
+    fn prepared_for_training_len(&self) -> usize;
+
+    /// Overwrites `prepared` with what [`Pass::prepared`] is to be.
+    fn prepare_for_training(&self, params: &[f32], prepared: &mut [f32]);
+
     /// As [`Layer::infer`], to the same bits.
     fn infer_prepared(&self, prepared: &[f32], n: usize, x: &[f32], y: &mut [f32], scratch: &mut [f32]);
 }
@@ -215,7 +224,7 @@ pub trait Prepared {
 /// [`Layer::backward`] has found the gradients of the parameters.
 pub trait Linear {
     /// Overwrites `dx`, as [`Layer::backward`] does.
-    fn backward_input(&self, params: &[f32], n: usize, dy: &[f32], dx: &mut [f32], scratch: &mut [f32]);
+    fn backward_input(&self, params: &[f32], pass: &Pass, n: usize, dy: &[f32], dx: &mut [f32], scratch: &mut [f32]);
 }
 
 /// The barrier of a layer that looks at the whole batch at once (batch normalisation).

@@ -134,7 +134,7 @@ mod tests {
     #[test]
     fn the_first_of_equal_maxima_gets_the_gradient() {
         let layer = MaxPool::new(Shape::new(1, 2, 2), [2, 2], [2, 2], Isa::best()).unwrap();
-        let pass = Pass { seed: 0, step: 0, layer: 0, first_image: 0, moments: &[] };
+        let pass = Pass { seed: 0, step: 0, layer: 0, first_image: 0, moments: &[], prepared: &[] };
         let (x, y, dy, mut dx) = ([0.0, 3.0, 3.0, 1.0], [3.0], [2.0], [f32::NAN; 4]);
         let grads = Grads { dparams: &mut [], scratch: &mut [] };
         layer.backward(&[], &pass, 1, Pair { x: &x, y: &y, dy: &dy }, Some(&mut dx), grads);

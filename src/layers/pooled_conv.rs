@@ -4,7 +4,7 @@ use steersman_kernels::activation;
 use steersman_kernels::pool::{self, PoolShape};
 use steersman_kernels::{Isa, conv::Conv};
 
-use super::{Conv2d, Grads, Layer, Pair, Prepared};
+use super::{Conv2d, Grads, Layer, Pair, Pass, Prepared};
 
 /// An activation that never falls, so that the largest of a window stays the largest.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -60,16 +60,15 @@ impl PooledConv {
         }
     }
 
-    /// Overwrites `y`, and `starts`, as long as `y`, with where the window of the convolution that was largest begins in a
+    /// The pass must have its [`Pass::prepared`]. Overwrites `y`, and `starts`, as long as `y`, with where the window of the convolution that was largest begins in a
     /// plane of the image.
-    pub fn forward(&self, params: &[f32], n: usize, x: &[f32], y: &mut [f32], starts: &mut [u32], scratch: &mut [f32]) {
-        let (weight, bias) = self.conv.split(params);
+    pub fn forward(&self, pass: &Pass, n: usize, x: &[f32], y: &mut [f32], starts: &mut [u32], scratch: &mut [f32]) {
         let (map, scratch) = scratch.split_at_mut(self.pool.c * self.pool.h * self.pool.w);
         let (pooled, scratch) = scratch.split_at_mut(self.output_len());
         let input = self.conv.input();
         let outputs = y.chunks_exact_mut(self.output_len()).zip(starts.chunks_exact_mut(self.output_len()));
         for (x, (y, starts)) in x.chunks_exact(input.len()).zip(outputs).take(n) {
-            self.kernel().forward(1, x, weight, bias, map, scratch);
+            self.kernel().forward_packed(1, x, pass.prepared, map, scratch);
             pool::max_forward_with_places(self.isa, &self.pool, 1, input.w, map, pooled, starts);
             self.activate(pooled, y);
         }
@@ -100,6 +99,14 @@ impl Prepared for PooledConv {
     }
 
     fn prepare(&self, params: &[f32], prepared: &mut [f32]) {
+        self.conv.prepare(params, prepared);
+    }
+
+    fn prepared_for_training_len(&self) -> usize {
+        self.conv.prepared_len()
+    }
+
+    fn prepare_for_training(&self, params: &[f32], prepared: &mut [f32]) {
         self.conv.prepare(params, prepared);
     }
 

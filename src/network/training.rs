@@ -8,7 +8,7 @@
 //! all: then a shard takes a few images at a time forward *and* backward, and their activations stay in the cache.
 
 use std::ops::Range;
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use rayon::prelude::*;
 use steersman_kernels::{Isa, update};
@@ -49,13 +49,17 @@ pub struct StepInput<'a> {
 #[derive(Debug)]
 pub struct TrainingPlan {
     shards: Vec<Shard>,
-    /// The buffers that no shard is using, in networks without a barrier; those used last are at the end.
-    spare: Mutex<Vec<Buffers>>,
+    /// The buffers that no shard is using, in networks without a barrier.
+    spare_buffers: Spare<Buffers>,
+    /// The scratch that no shard is using.
+    spare_scratch: Spare<Vec<f32>>,
     /// Gradient of the mean loss with respect to [`Parameters::values`].
     gradient: Vec<f32>,
     /// Sum of squares of each chunk of the gradient.
     chunk_squares: Vec<f64>,
     stages: Vec<Stage>,
+    /// The parameters of each stage as its passes read them, made anew in every step.
+    prepared: Vec<Vec<f32>>,
     /// What the barriers found out about the batch, all stages one after the other.
     moments: Vec<f32>,
     /// Where each stage's part of `moments` lies.
@@ -76,15 +80,16 @@ struct Shard {
     images: Range<usize>,
     /// Empty between the steps of a network without a barrier.
     buffers: Buffers,
+    /// Empty while the shard is not worked on.
+    scratch: Vec<f32>,
     gradient: Vec<f32>,
     sums: Vec<f64>,
     /// Sum of the losses of all images.
     loss: f64,
 }
 
-/// What a shard computes in. With a barrier the activations have to wait there, and each shard has its own. Without one a
-/// shard is done with them when it is done, and takes those that were used last: then no more of them are touched than threads
-/// are at work, which spares memory and the cache.
+/// The maps of a shard. With a barrier the activations have to wait there, and each shard has its own. Without one a shard is done
+/// with them when it is done.
 #[derive(Debug, Default)]
 struct Buffers {
     /// Output of each stage.
@@ -96,7 +101,29 @@ struct Buffers {
     d_input: Vec<f32>,
     /// Whether the gradient with respect to the current stage's output has taken the place of that output instead.
     in_place: bool,
-    scratch: Vec<f32>,
+}
+
+/// Buffers that are not in use. Those put back last are taken first, so that no more are ever touched than threads are at work,
+/// and they are still in the cache.
+#[derive(Debug)]
+struct Spare<T>(Mutex<Vec<T>>);
+
+impl<T> Spare<T> {
+    fn new(items: Vec<T>) -> Spare<T> {
+        Spare(Mutex::new(items))
+    }
+
+    fn take(&self) -> T {
+        self.items().pop().expect("there are as many as shards")
+    }
+
+    fn put(&self, item: T) {
+        self.items().push(item);
+    }
+
+    fn items(&self) -> MutexGuard<'_, Vec<T>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
 }
 
 impl TrainingPlan {
@@ -143,13 +170,13 @@ impl TrainingPlan {
                 d_output: vec![0.0; group * largest],
                 d_input: vec![0.0; group * largest],
                 in_place: false,
-                scratch: vec![0.0; scratch_len],
             })
             .collect();
         let shards = (0..capacity.min(MAX_SHARDS))
             .map(|_| Shard {
                 images: 0..0,
                 buffers: if segments.len() > 1 { spare.pop().unwrap_or_default() } else { Buffers::default() },
+                scratch: Vec::new(),
                 gradient: vec![0.0; network.count(true)],
                 sums: vec![0.0; sums_len],
                 loss: 0.0,
@@ -157,11 +184,17 @@ impl TrainingPlan {
             .collect();
         TrainingPlan {
             shards,
-            spare: Mutex::new(spare),
+            spare_buffers: Spare::new(spare),
+            spare_scratch: Spare::new((0..capacity.min(MAX_SHARDS)).map(|_| vec![0.0; scratch_len]).collect()),
             gradient: vec![0.0; network.count(true)],
             chunk_squares: vec![0.0; network.count(true).div_ceil(CHUNK)],
             first_learning: stages.iter().position(|stage| stage.learns(network)).unwrap_or(stages.len()),
             times: StepTimes::off(stages.len()),
+            prepared: stages
+                .iter()
+                .map(|stage| stage.prepared(network).map_or(0, |prepared| prepared.prepared_for_training_len()))
+                .map(|len| vec![0.0; len])
+                .collect(),
             stages,
             moments: vec![0.0; moments_end],
             moments_of,
@@ -217,6 +250,7 @@ impl TrainingPlan {
             shard.images = index * shard_images..((index + 1) * shard_images).min(n);
         }
         self.freeze_moments(network, parameters);
+        self.prepare(network, parameters);
         if self.segments.len() == 1 {
             self.step_without_barriers(network, parameters, loss, input, used);
         } else {
@@ -224,6 +258,15 @@ impl TrainingPlan {
         }
         self.reduce_gradient(network, used);
         self.shards[..used].iter().map(|shard| shard.loss).sum::<f64>() / input.labels.len() as f64
+    }
+
+    /// Puts the parameters in the order in which the passes read them, once for all shards.
+    fn prepare(&mut self, network: &Network, parameters: &Parameters) {
+        self.prepared.par_iter_mut().zip(&self.stages).for_each(|(to, stage)| {
+            if let Some(prepared) = stage.prepared(network) {
+                prepared.prepare_for_training(&parameters.values[stage.params(network)], to);
+            }
+        });
     }
 
     /// The moments of frozen batch normalisation.
@@ -246,15 +289,24 @@ impl TrainingPlan {
         input: StepInput,
         used: usize,
     ) {
-        let TrainingPlan { shards, spare, stages, moments, moments_of, first_learning, times, .. } = self;
+        let TrainingPlan {
+            shards,
+            spare_buffers,
+            spare_scratch,
+            stages,
+            prepared,
+            moments,
+            moments_of,
+            first_learning,
+            times,
+            ..
+        } = self;
         let first_learning = *first_learning;
-        let spare = &*spare;
-        let spare = || spare.lock().unwrap_or_else(PoisonError::into_inner);
-        let run = Run { network, parameters, stages, moments, moments_of, first_learning, input, times };
+        let run = Run { network, parameters, stages, prepared, moments, moments_of, first_learning, input, times };
         shards[..used].par_iter_mut().for_each(|shard| {
             shard.reset();
-            let buffers = spare().pop().expect("there are as many buffers as shards");
-            shard.buffers = buffers;
+            shard.buffers = spare_buffers.take();
+            shard.scratch = spare_scratch.take();
             let group = shard.group_capacity(network);
             for start in shard.images.clone().step_by(group) {
                 let images = start..(start + group).min(shard.images.end);
@@ -262,8 +314,8 @@ impl TrainingPlan {
                 run.loss(loss, shard, images.clone());
                 run.backward(0..stages.len(), shard, images);
             }
-            let buffers = std::mem::take(&mut shard.buffers);
-            spare().push(buffers);
+            spare_buffers.put(std::mem::take(&mut shard.buffers));
+            spare_scratch.put(std::mem::take(&mut shard.scratch));
         });
     }
 
@@ -275,7 +327,19 @@ impl TrainingPlan {
         input: StepInput,
         used: usize,
     ) {
-        let TrainingPlan { shards, stages, moments, moments_of, sums, segments, first_learning, times, .. } = self;
+        let TrainingPlan {
+            shards,
+            spare_scratch,
+            stages,
+            prepared,
+            moments,
+            moments_of,
+            sums,
+            segments,
+            first_learning,
+            times,
+            ..
+        } = self;
         let first_learning = *first_learning;
         let shards = &mut shards[..used];
         let images = shards.last().map_or(0, |shard| shard.images.end);
@@ -285,17 +349,19 @@ impl TrainingPlan {
         let last = segments.len() - 1;
 
         for (index, segment) in segments.iter().enumerate() {
-            let run = Run { network, parameters, stages, moments, moments_of, first_learning, input, times };
+            let run = Run { network, parameters, stages, prepared, moments, moments_of, first_learning, input, times };
             let next_barrier = segments.get(index + 1).map(|next| next.start);
             shards.par_iter_mut().for_each(|shard| {
                 if index == 0 {
                     shard.reset();
                 }
+                shard.scratch = spare_scratch.take();
                 run.forward(segment.clone(), shard, shard.images.clone());
                 match next_barrier {
                     Some(stage) => run.forward_sums(stage, barrier(stage), shard),
                     None => run.loss(loss, shard, shard.images.clone()),
                 }
+                spare_scratch.put(std::mem::take(&mut shard.scratch));
             });
             if let Some(stage) = next_barrier {
                 let layer = &network.layers()[stages[stage].layers.start];
@@ -310,10 +376,11 @@ impl TrainingPlan {
             }
         }
         for (index, segment) in segments.iter().enumerate().rev() {
-            let run = Run { network, parameters, stages, moments, moments_of, first_learning, input, times };
+            let run = Run { network, parameters, stages, prepared, moments, moments_of, first_learning, input, times };
             // The stage at the start of a segment waits for the sums over all shards.
             let rest = if index > 0 { segment.start + 1..segment.end } else { segment.clone() };
             shards.par_iter_mut().for_each(|shard| {
+                shard.scratch = spare_scratch.take();
                 if index < last {
                     let next = segments[index + 1].start;
                     run.backward(next..next + 1, shard, shard.images.clone());
@@ -322,6 +389,7 @@ impl TrainingPlan {
                 if index > 0 {
                     run.backward_sums(segment.start, barrier(segment.start), shard);
                 }
+                spare_scratch.put(std::mem::take(&mut shard.scratch));
             });
             if index > 0 {
                 let stage = segment.start;
@@ -407,6 +475,7 @@ struct Run<'a> {
     network: &'a Network,
     parameters: &'a Parameters,
     stages: &'a [Stage],
+    prepared: &'a [Vec<f32>],
     moments: &'a [f32],
     moments_of: &'a [Range<usize>],
     first_learning: usize,
@@ -418,7 +487,14 @@ impl<'a> Run<'a> {
     fn pass(&self, stage: usize, first_image: usize) -> Pass<'a> {
         let moments = &self.moments[self.moments_of[stage].clone()];
         let layer = self.stages[stage].layers.start;
-        Pass { seed: self.input.seed, step: self.input.step, layer, first_image, moments }
+        Pass {
+            seed: self.input.seed,
+            step: self.input.step,
+            layer,
+            first_image,
+            moments,
+            prepared: &self.prepared[stage],
+        }
     }
 
     fn params(&self, stage: usize) -> &'a [f32] {
@@ -448,12 +524,12 @@ impl<'a> Run<'a> {
             self.times.stages[index][0].time(|| match &stage.kind {
                 Kind::Layer => {
                     let layer = &self.network.layers()[stage.layers.start].layer;
-                    layer.forward(params, &pass, n, x, y, &mut shard.buffers.scratch);
+                    layer.forward(params, &pass, n, x, y, &mut shard.scratch);
                 }
                 Kind::NormRectify(fused) => fused.forward(params, &pass, n, x, y),
                 Kind::PooledConv(fused) => {
                     let places = &mut shard.buffers.places[index][..y.len()];
-                    fused.forward(params, n, x, y, places, &mut shard.buffers.scratch);
+                    fused.forward(&pass, n, x, y, places, &mut shard.scratch);
                 }
             });
         }
@@ -498,7 +574,7 @@ impl<'a> Run<'a> {
                         Pair { x, y: &shard.buffers.activations[index][..y_len], dy: &shard.buffers.d_output[..y_len] };
                     let dx = wanted.map(|_| &mut shard.buffers.d_input[..x_len]);
                     let dparams = &mut shard.gradient[stage.params(self.network)];
-                    let grads = Grads { dparams, scratch: &mut shard.buffers.scratch };
+                    let grads = Grads { dparams, scratch: &mut shard.scratch };
                     fused.backward(params, n, pair, &shard.buffers.places[index][..y_len], dx, grads);
                 }
                 Kind::Layer => {
@@ -510,7 +586,7 @@ impl<'a> Run<'a> {
                     let apart = wanted.is_some() && replaces.is_none();
                     let dx = if apart { Some(&mut shard.buffers.d_input[..x_len]) } else { None };
                     let dparams = &mut shard.gradient[stage.params(self.network)];
-                    layer.backward(params, &pass, n, pair, dx, Grads { dparams, scratch: &mut shard.buffers.scratch });
+                    layer.backward(params, &pass, n, pair, dx, Grads { dparams, scratch: &mut shard.scratch });
                     if let (Some(linear), Some(source)) = (layer.linear(), replaces.and(wanted)) {
                         let (before, from_here) = shard.buffers.activations.split_at_mut(index);
                         let dy = if shard.buffers.in_place {
@@ -518,7 +594,7 @@ impl<'a> Run<'a> {
                         } else {
                             &shard.buffers.d_output[..y_len]
                         };
-                        linear.backward_input(params, n, dy, &mut before[source][..x_len], &mut shard.buffers.scratch);
+                        linear.backward_input(params, &pass, n, dy, &mut before[source][..x_len], &mut shard.scratch);
                     }
                 }
             });

@@ -22,7 +22,7 @@ const BLOCK_TAPS: (usize, usize) = (48, 240);
 const GROUP_INPUT: usize = 32_768;
 
 /// Output channels of a tile for `channels` in all: the height that leaves the fewest rows empty.
-fn tile_height(many_registers: bool, channels: usize) -> usize {
+pub(super) fn tile_height(many_registers: bool, channels: usize) -> usize {
     let heights: &[usize] = if many_registers { &[8, 6, 4] } else { &[6, 4] };
     *heights.iter().min_by_key(|&&height| channels.div_ceil(height) * height).unwrap_or(&4)
 }
@@ -246,7 +246,7 @@ struct Place<'a> {
 /// # Safety
 /// For every start and tap, `reach` elements from `start + tap` on are readable, and `LANES` unless `MASKED`.
 #[inline(always)]
-unsafe fn tile<S: Simd, const MR: usize, const NV: usize, const MASKED: bool>(
+pub(super) unsafe fn tile<S: Simd, const MR: usize, const NV: usize, const MASKED: bool>(
     simd: S,
     taps: &[usize],
     starts: [*const f32; NV],

@@ -19,18 +19,18 @@ use crate::simd::Simd;
 
 /// The rows, or columns, of the input that leave one remainder.
 #[derive(Clone, Copy, Debug)]
-struct Phase {
+pub(super) struct Phase {
     /// The remainder.
-    remainder: usize,
+    pub remainder: usize,
     /// Number of taps that touch them.
-    taps: usize,
+    pub taps: usize,
     /// The first quotient `q`, and how many there are.
-    first: usize,
-    count: usize,
+    pub first: usize,
+    pub count: usize,
 }
 
 /// The phases of one direction that have any rows and taps.
-fn phases(len: usize, kernel: usize, stride: usize, pad: usize) -> Vec<Phase> {
+pub(super) fn phases(len: usize, kernel: usize, stride: usize, pad: usize) -> Vec<Phase> {
     let phase = |remainder: usize| {
         let first = pad.saturating_sub(remainder).div_ceil(stride);
         let end = (len + pad).saturating_sub(remainder).div_ceil(stride);
@@ -156,11 +156,15 @@ impl InputGradient {
         self.shape.oc * self.padded.0 * self.padded.1
     }
 
-    /// Elements of the weights of all parts, and of the largest phase of one image.
-    fn part_lens(&self) -> (usize, usize) {
-        let packed = self.parts.iter().map(|part| part.sum.packed_len()).sum();
+    /// Elements of the largest phase of one image.
+    fn phase_len(&self) -> usize {
         let phase = self.parts.iter().map(|part| part.sum.channels * part.sum.plane).max().unwrap_or(0);
-        (packed, if self.direct() { 0 } else { phase })
+        if self.direct() { 0 } else { phase }
+    }
+
+    /// Whether the gradient is a matrix product.
+    pub fn by_product(&self) -> bool {
+        self.by_product
     }
 
     /// Whether the single part is the whole input gradient.
@@ -168,14 +172,37 @@ impl InputGradient {
         self.shape.stride_h == 1 && self.shape.stride_w == 1
     }
 
+    /// Elements of [`run`]'s scratch.
     pub fn scratch_len(&self) -> usize {
         if self.by_product {
             let (pixels, taps) = (self.shape.out_pixels(), self.shape.taps());
             return pixels * taps + gemm_scratch_len(pixels, self.shape.oc, taps);
         }
-        let group = group_of(self.image(), FORWARD_COPIES);
-        let (packed, phase) = self.part_lens();
-        group * (self.image() + phase) + MOST_LANES + packed
+        group_of(self.image(), FORWARD_COPIES) * (self.image() + self.phase_len()) + MOST_LANES
+    }
+
+    /// Elements of [`InputGradient::pack`]'s result.
+    pub fn packed_len(&self) -> usize {
+        if self.by_product {
+            self.shape.oc * self.shape.taps()
+        } else {
+            self.parts.iter().map(|part| part.sum.packed_len()).sum()
+        }
+    }
+
+    /// Puts the weights in the order in which [`run`] reads them.
+    #[inline(always)]
+    pub fn pack<S: Simd>(&self, simd: S, weight: &[f32], packed: &mut [f32]) {
+        if self.by_product {
+            packed.copy_from_slice(weight);
+            return;
+        }
+        let mut rest = packed;
+        for part in &self.parts {
+            let (to, after) = rest.split_at_mut(part.sum.packed_len());
+            rest = after;
+            part.sum.pack(simd, None, weight, to);
+        }
     }
 
     /// Copies output gradients `[oc][out_h][out_w]` into zero-padded planes.
@@ -206,10 +233,10 @@ impl InputGradient {
     }
 }
 
-/// The input gradient of the images in `dy`; `dx` is overwritten.
-pub(crate) fn run(isa: Isa, gradient: &InputGradient, dy: &[f32], weight: &[f32], dx: &mut [f32], scratch: &mut [f32]) {
+/// The input gradient of the images in `dy`, with weights from [`InputGradient::pack`]; `dx` is overwritten.
+pub(crate) fn run(isa: Isa, gradient: &InputGradient, dy: &[f32], packed: &[f32], dx: &mut [f32], scratch: &mut [f32]) {
     if !gradient.by_product {
-        return by_taps(isa, gradient, dy, weight, dx, scratch);
+        return by_taps(isa, gradient, dy, packed, dx, scratch);
     }
     let shape = &gradient.shape;
     let (pixels, taps) = (shape.out_pixels(), shape.taps());
@@ -217,7 +244,7 @@ pub(crate) fn run(isa: Isa, gradient: &InputGradient, dy: &[f32], weight: &[f32]
     dx.fill(0.0);
     for (dy, dx) in dy.chunks_exact(shape.y_len()).zip(dx.chunks_exact_mut(shape.x_len())) {
         let (m, k, n) = (pixels, shape.oc, taps);
-        gemm(isa, m, k, n, 1.0, dy, (1, pixels), weight, (taps, 1), 0.0, patches, (taps, 1), scratch);
+        gemm(isa, m, k, n, 1.0, dy, (1, pixels), packed, (taps, 1), 0.0, patches, (taps, 1), scratch);
         col2im(shape, patches, dx);
     }
 }
@@ -227,22 +254,13 @@ per_isa! {
         simd: S,
         gradient: &InputGradient,
         dy: &[f32],
-        weight: &[f32],
+        packed: &[f32],
         dx: &mut [f32],
         scratch: &mut [f32],
     ) {
         let c = gradient.shape.c;
         let group = group_of(gradient.image(), FORWARD_COPIES);
-        let (packed_len, phase_len) = gradient.part_lens();
-        let (packed, scratch) = scratch.split_at_mut(packed_len);
-        let (phase, copy) = scratch.split_at_mut(group * phase_len);
-
-        let mut rest = &mut *packed;
-        for part in &gradient.parts {
-            let (to, after) = rest.split_at_mut(part.sum.packed_len());
-            rest = after;
-            part.sum.pack(simd, None, weight, to);
-        }
+        let (phase, copy) = scratch.split_at_mut(group * gradient.phase_len());
 
         // Input that no window touches keeps this zero; with stride 1 the single part writes everything.
         if !gradient.direct() || gradient.parts.is_empty() {
@@ -255,7 +273,7 @@ per_isa! {
             gradient.pad(dy, &mut copy[..used]);
             copy[used..used + MOST_LANES].fill(0.0);
             let padded = &copy[..used + MOST_LANES];
-            let mut rest = &*packed;
+            let mut rest = packed;
             for part in &gradient.parts {
                 let (packed, after) = rest.split_at(part.sum.packed_len());
                 rest = after;

@@ -14,7 +14,7 @@ pub(crate) struct Layout {
     /// Phases in each direction; remainders that no tap has are left out.
     phases: (usize, usize),
     /// Rows of a phase plane.
-    rows: usize,
+    pub rows: usize,
     /// Elements between two rows of a phase plane.
     pub pitch: usize,
     /// Whether images must be copied into this layout.

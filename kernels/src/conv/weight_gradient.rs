@@ -9,7 +9,7 @@ use super::direct::TapSum;
 use crate::simd::{ALIGNMENT, Simd, align};
 
 /// Taps in a tile.
-const TILE_TAPS: usize = 3;
+pub(super) const TILE_TAPS: usize = 3;
 /// Vectors of positions that are packed at a time: 32 x 8 channels x 64 bytes, or 64 x 4 x 32, are at most half of a
 /// 32 KiB cache.
 const MOST_CHUNK: usize = 64;
@@ -119,17 +119,26 @@ fn run_height<S: Simd, const MR: usize>(
         for r in 0..rows {
             let o = first + r;
             dbias[o] += simd.sum(bias[r]);
-            for (eight, dweight) in dweight[o * taps..][..taps].chunks_mut(8).enumerate() {
-                let mut of_taps = [simd.splat(0.0); 8];
-                let from = &sums[(r * row + eight * 8) * S::LANES..][..dweight.len() * S::LANES];
-                for (k, of_tap) in of_taps.iter_mut().enumerate().take(dweight.len()) {
-                    // SAFETY: `from` holds a vector for each tap.
-                    *of_tap = unsafe { simd.load(from.as_ptr().add(k * S::LANES)) };
-                }
-                for (dweight, sum) in dweight.iter_mut().zip(simd.sums(of_taps)) {
-                    *dweight += sum;
-                }
-            }
+            // SAFETY: `sums` holds a vector for each tap.
+            unsafe { add_lanes(simd, sums[r * row * S::LANES..].as_ptr(), &mut dweight[o * taps..][..taps]) };
+        }
+    }
+}
+
+/// Adds the sum over the lanes of each of the vectors from `sums` on to `to`.
+///
+/// # Safety
+/// `sums` must be valid for reading as many vectors as `to` has elements.
+#[inline(always)]
+pub(super) unsafe fn add_lanes<S: Simd>(simd: S, sums: *const f32, to: &mut [f32]) {
+    for (eight, to) in to.chunks_mut(8).enumerate() {
+        let mut vectors = [simd.splat(0.0); 8];
+        for (k, vector) in vectors.iter_mut().enumerate().take(to.len()) {
+            // SAFETY: as the caller promises.
+            *vector = unsafe { simd.load(sums.add((eight * 8 + k) * S::LANES)) };
+        }
+        for (to, sum) in to.iter_mut().zip(simd.sums(vectors)) {
+            *to += sum;
         }
     }
 }

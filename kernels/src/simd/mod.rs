@@ -44,6 +44,14 @@ pub(crate) fn put<S: Simd>(simd: S, to: &mut [f32], at: usize, v: S::V) {
     unsafe { simd.store(to.as_mut_ptr(), v) };
 }
 
+/// Writes the first `count` lanes, at most `LANES`, from `at` on.
+#[inline(always)]
+pub(crate) fn put_first<S: Simd>(simd: S, to: &mut [f32], at: usize, v: S::V, count: usize) {
+    let to = &mut to[at..at + count.min(S::LANES)];
+    // SAFETY: the slice has as many elements as are written.
+    unsafe { simd.store_first(to.as_mut_ptr(), v, to.len()) };
+}
+
 /// Twice `LANES` elements from `at` on, those at even places first.
 #[inline(always)]
 pub(crate) fn get_pairs<S: Simd>(simd: S, from: &[f32], at: usize) -> [S::V; 2] {
@@ -58,6 +66,15 @@ pub(crate) fn put_pairs<S: Simd>(simd: S, to: &mut [f32], at: usize, v: [S::V; 2
     let to = &mut to[at..at + 2 * S::LANES];
     // SAFETY: the slice has twice `LANES` elements.
     unsafe { simd.store_pairs(to.as_mut_ptr(), v) };
+}
+
+/// Has part `part` of `parts` of what is to be read before long fetched into the second-level cache.
+#[inline(always)]
+pub(crate) fn prefetch_part<S: Simd>(simd: S, upcoming: &[f32], part: usize, parts: usize) {
+    let lines = upcoming.len() / ALIGNMENT;
+    for line in lines * part / parts..lines * (part + 1) / parts {
+        simd.prefetch_to_read(upcoming[line * ALIGNMENT..].as_ptr());
+    }
 }
 
 /// Vectors of `LANES` values of `f32`.
@@ -87,6 +104,17 @@ pub(crate) trait Simd: Copy {
             sums[i] = self.sum(v[i]);
         }
         sums
+    }
+
+    /// Has the cache line of an address fetched that is to be written to soon; any address will do.
+    #[inline(always)]
+    fn prefetch_to_write(self, p: *const f32) {
+        let _ = p;
+    }
+    /// Has the cache line of an address fetched into the second level, as it is to be read before long; any address will do.
+    #[inline(always)]
+    fn prefetch_to_read(self, p: *const f32) {
+        let _ = p;
     }
 
     /// Reads `LANES` values.

@@ -32,6 +32,18 @@ impl Simd for Avx2 {
     const MANY_REGISTERS: bool = false;
 
     #[inline(always)]
+    fn prefetch_to_write(self, p: *const f32) {
+        // SAFETY: the token proves x86-64 with AVX2, which has the instruction; it reads and writes nothing.
+        unsafe { _mm_prefetch::<_MM_HINT_ET0>(p.cast()) }
+    }
+
+    #[inline(always)]
+    fn prefetch_to_read(self, p: *const f32) {
+        // SAFETY: the token proves x86-64; the instruction reads and writes nothing.
+        unsafe { _mm_prefetch::<_MM_HINT_T1>(p.cast()) }
+    }
+
+    #[inline(always)]
     fn splat(self, value: f32) -> __m256 {
         // SAFETY: the token proves AVX2.
         unsafe { _mm256_set1_ps(value) }
@@ -258,6 +270,18 @@ impl Simd for Avx512 {
     type V = __m512;
     const LANES: usize = 16;
     const MANY_REGISTERS: bool = true;
+
+    #[inline(always)]
+    fn prefetch_to_write(self, p: *const f32) {
+        // SAFETY: the token proves x86-64 with AVX2, which has the instruction; it reads and writes nothing.
+        unsafe { _mm_prefetch::<_MM_HINT_ET0>(p.cast()) }
+    }
+
+    #[inline(always)]
+    fn prefetch_to_read(self, p: *const f32) {
+        // SAFETY: the token proves x86-64; the instruction reads and writes nothing.
+        unsafe { _mm_prefetch::<_MM_HINT_T1>(p.cast()) }
+    }
 
     #[inline(always)]
     fn splat(self, value: f32) -> __m512 {

@@ -1,0 +1,277 @@
+//! How the rows of maps are cut into tiles, and where the points of a tile lie.
+
+use std::ops::Range;
+
+use super::transform::{self, MOST_POINTS, MOST_ROWS};
+use crate::simd::{Simd, put_first};
+
+/// Images that are worked on together when each has few rows.
+const MOST_IMAGES: usize = 8;
+/// The most lanes a vector has.
+const MOST_LANES: usize = 16;
+
+/// Tiles of rows, and how many of them go through a pass together.
+///
+/// A strip is `per_strip` tiles of each of `images` images. Its points are kept as planes `[point][plane][position]`: in a
+/// plane the tiles follow each other image by image, each `pitch` positions wide, so vectors run on across tiles and
+/// images and only the last is not full.
+#[derive(Clone, Debug)]
+pub(super) struct Strips {
+    /// Rows of the output in a tile, M: 2 or 4.
+    pub rows: usize,
+    /// Tiles of a map.
+    pub tiles: usize,
+    /// Positions of a tile.
+    pub pitch: usize,
+    /// Tiles of an image in a strip, and images in it; more than one image only if all tiles are.
+    pub per_strip: usize,
+    pub images: usize,
+    /// Elements of a plane: room for whole vectors shifted by every tap, which reach less than `reach` beyond the positions.
+    pub plane: usize,
+    reach: usize,
+}
+
+/// Where in a plane of points a strip lies, and how much there is in it.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Strip {
+    pub images: usize,
+    pub first_tile: usize,
+    pub tiles: usize,
+}
+
+impl Strips {
+    /// Cuts maps of `height` rows into tiles of `rows`, `pitch` positions wide. `most` tells how many tiles of so many positions go
+    /// into a strip. Taps shift vectors by less than `width`.
+    pub fn new(rows: usize, height: usize, pitch: usize, width: usize, most: impl FnOnce(usize) -> usize) -> Strips {
+        let tiles = height.div_ceil(rows);
+        let most = most(pitch).max(1);
+        let per_strip = tiles.div_ceil(tiles.div_ceil(most));
+        let images = if per_strip < tiles { 1 } else { (most / tiles).clamp(1, MOST_IMAGES) };
+        let reach = MOST_LANES + width;
+        let plane = (images * per_strip * pitch + reach).next_multiple_of(MOST_LANES);
+        // An odd number of cache lines, so that the same positions of many planes do not compete for the same places.
+        let plane = if plane / MOST_LANES % 2 == 0 { plane + MOST_LANES } else { plane };
+        Strips { rows, tiles, pitch, per_strip, images, plane, reach }
+    }
+
+    /// How many points a tile has.
+    pub fn points(&self) -> usize {
+        self.rows + 2
+    }
+
+    /// The strips of up to [`Strips::images`] images.
+    pub fn of(&self, images: usize) -> impl Iterator<Item = Strip> {
+        let (tiles, per_strip) = (self.tiles, self.per_strip);
+        (0..tiles).step_by(per_strip).map(move |first_tile| Strip {
+            images,
+            first_tile,
+            tiles: per_strip.min(tiles - first_tile),
+        })
+    }
+
+    /// The part of what comes after the strips of `images` images, `next`, that is to be fetched during `strip`.
+    pub fn upcoming<'a>(&self, strip: Strip, next: &'a [f32]) -> &'a [f32] {
+        let part = |tile: usize| next.len() * tile / self.tiles;
+        &next[part(strip.first_tile)..part(strip.first_tile + strip.tiles)]
+    }
+
+    /// Positions of a plane that a strip fills.
+    pub fn used(&self, strip: Strip) -> usize {
+        strip.images * strip.tiles * self.pitch
+    }
+
+    /// The points of the input `from`, whose images are `per_image` maps each, into planes `[point][per_image][plane]`.
+    ///
+    /// Tile `t` is rows `t M - above` to `t M - above + M + 1` of a map, and column `i` is written to position `i + left`;
+    /// what lies outside the map is 0.
+    #[inline(always)]
+    pub fn input<S: Simd, const M: usize>(
+        &self,
+        simd: S,
+        strip: Strip,
+        maps: Maps,
+        per_image: usize,
+        from: &[f32],
+        points: &mut [f32],
+    ) {
+        let Maps { height, width, above, left } = maps;
+        let stride = per_image * self.plane;
+        for map in 0..per_image {
+            for image in 0..strip.images {
+                let from = &from[(image * per_image + map) * height * width..][..height * width];
+                for tile in 0..strip.tiles {
+                    let at = map * self.plane + self.position(strip, image, tile);
+                    let top = (strip.first_tile + tile) * M;
+                    if left > 0 || width < self.pitch {
+                        for point in 0..M + 2 {
+                            let to = &mut points[point * stride + at..][..self.pitch];
+                            to[..left].fill(0.0);
+                            to[left + width..].fill(0.0);
+                        }
+                    }
+                    // Rows of the tile that the map has: all but at its border.
+                    let has = above.saturating_sub(top).min(M + 2)..(height + above).saturating_sub(top).min(M + 2);
+                    let first = (top + has.start).saturating_sub(above);
+                    let to = &mut points[at + left..];
+                    // A range known to be all needs no tests.
+                    if has == (0..M + 2) {
+                        input_tile::<S, M>(simd, &from[first * width..], width, 0..M + 2, stride, to);
+                    } else {
+                        input_tile::<S, M>(simd, &from[first * width..], width, has, stride, to);
+                    }
+                }
+            }
+        }
+    }
+
+    /// The points of the gradient `dy` of the output, whose images are `per_image` maps of `height` times `width` each,
+    /// into planes `[point][per_image][plane]`, 0 between the tiles.
+    #[inline(always)]
+    pub fn output_gradient<S: Simd, const M: usize>(
+        &self,
+        simd: S,
+        strip: Strip,
+        [height, width]: [usize; 2],
+        per_image: usize,
+        dy: &[f32],
+        points: &mut [f32],
+    ) {
+        let stride = per_image * self.plane;
+        for map in 0..per_image {
+            for image in 0..strip.images {
+                let dy = &dy[(image * per_image + map) * height * width..][..height * width];
+                for tile in 0..strip.tiles {
+                    let at = map * self.plane + self.position(strip, image, tile);
+                    let first = (strip.first_tile + tile) * M;
+                    let rows = M.min(height - first);
+                    let (dy, to) = (&dy[first * width..], &mut points[at..]);
+                    // A number known to be all needs no tests.
+                    if rows == M {
+                        output_gradient_tile::<S, M>(simd, dy, width, M, stride, to);
+                    } else {
+                        output_gradient_tile::<S, M>(simd, dy, width, rows, stride, to);
+                    }
+                    for point in 0..M + 2 {
+                        for at in (width..self.pitch).step_by(S::LANES) {
+                            put_first(simd, to, point * stride + at, simd.splat(0.0), self.pitch - at);
+                        }
+                    }
+                }
+            }
+        }
+    }
+
+    /// Where a tile begins in a plane.
+    fn position(&self, strip: Strip, image: usize, tile: usize) -> usize {
+        (image * strip.tiles + tile) * self.pitch
+    }
+
+    /// Zeros after the strip in a plane of each point, as far as the taps shift the last vector.
+    #[inline(always)]
+    pub fn clear_rest<S: Simd>(&self, simd: S, strip: Strip, points: &mut [f32]) {
+        let used = self.used(strip);
+        for plane in points.chunks_exact_mut(self.plane) {
+            for at in (used..used + self.reach).step_by(S::LANES) {
+                put_first(simd, plane, at, simd.splat(0.0), self.plane - at);
+            }
+        }
+    }
+}
+
+/// The maps of an input, and where their first element lies in the first tile.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Maps {
+    pub height: usize,
+    pub width: usize,
+    /// Rows of zeros above.
+    pub above: usize,
+    /// Columns of zeros on the left.
+    pub left: usize,
+}
+
+/// The points of one tile, `stride` apart, from those of its rows that are there, one after the other in `from`.
+#[inline(always)]
+fn input_tile<S: Simd, const M: usize>(
+    simd: S,
+    from: &[f32],
+    width: usize,
+    has: Range<usize>,
+    stride: usize,
+    to: &mut [f32],
+) {
+    assert!(has.end <= M + 2 && from.len() >= has.len() * width, "winograd: a row is missing");
+    assert!(to.len() >= (M + 1) * stride + width, "winograd: too little room for the points");
+    let whole = width - width % S::LANES;
+    // SAFETY: `from` holds `width` elements of every row, and `to` as many at every point.
+    unsafe {
+        for column in (0..whole).step_by(S::LANES) {
+            let mut d = [simd.splat(0.0); MOST_POINTS];
+            for i in 0..M + 2 {
+                if has.contains(&i) {
+                    d[i] = simd.load(from.as_ptr().add((i - has.start) * width + column));
+                }
+            }
+            let p = transform::input::<S, M>(simd, d);
+            for u in 0..M + 2 {
+                simd.store(to.as_mut_ptr().add(u * stride + column), p[u]);
+            }
+        }
+        if whole < width {
+            let count = width - whole;
+            let mut d = [simd.splat(0.0); MOST_POINTS];
+            for i in 0..M + 2 {
+                if has.contains(&i) {
+                    d[i] = simd.load_first(from.as_ptr().add((i - has.start) * width + whole), count);
+                }
+            }
+            let p = transform::input::<S, M>(simd, d);
+            for u in 0..M + 2 {
+                simd.store_first(to.as_mut_ptr().add(u * stride + whole), p[u], count);
+            }
+        }
+    }
+}
+
+/// The points of the gradient of one tile, `stride` apart, from that of the `rows` rows it has.
+#[inline(always)]
+fn output_gradient_tile<S: Simd, const M: usize>(
+    simd: S,
+    dy: &[f32],
+    width: usize,
+    rows: usize,
+    stride: usize,
+    to: &mut [f32],
+) {
+    assert!(rows <= M && dy.len() >= rows * width, "winograd: a row is missing");
+    assert!(to.len() >= (M + 1) * stride + width, "winograd: too little room for the points");
+    let whole = width - width % S::LANES;
+    // SAFETY: `dy` holds `width` elements of every row, and `to` as many at every point.
+    unsafe {
+        for column in (0..whole).step_by(S::LANES) {
+            let mut d = [simd.splat(0.0); MOST_ROWS];
+            for i in 0..rows {
+                d[i] = simd.load(dy.as_ptr().add(i * width + column));
+            }
+            let p = transform::output_gradient::<S, M>(simd, d);
+            for u in 0..M + 2 {
+                simd.store(to.as_mut_ptr().add(u * stride + column), p[u]);
+            }
+        }
+        if whole < width {
+            let count = width - whole;
+            let mut d = [simd.splat(0.0); MOST_ROWS];
+            for i in 0..rows {
+                d[i] = simd.load_first(dy.as_ptr().add(i * width + whole), count);
+            }
+            let p = transform::output_gradient::<S, M>(simd, d);
+            for u in 0..M + 2 {
+                simd.store_first(to.as_mut_ptr().add(u * stride + whole), p[u], count);
+            }
+        }
+    }
+}
+
+/// The first `len` elements, or all there are, and the rest.
+pub(super) fn head(all: &[f32], len: usize) -> (&[f32], &[f32]) {
+    all.split_at(len.min(all.len()))
+}

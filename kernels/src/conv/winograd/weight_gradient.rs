@@ -1,0 +1,290 @@
+//! The weight gradient.
+//!
+//! At each point the gradient of the filters is a sum over all positions of the product of the points of the output's gradient
+//! and those of the input, shifted by each tap; only when all is summed are the points made into the gradient of the weights.
+//! As in the direct way, a tile is 8 channels by 3 taps and its sums stay spread over the lanes until the end of the strip.
+
+use super::GRADIENT_BUDGET;
+use super::input_points::{InputPoints, Taps};
+use super::strips::{Strip, Strips, head};
+use super::transform::{self, MOST_POINTS, POINT_ONE};
+use crate::conv::ConvShape;
+use crate::conv::weight_gradient::{TILE_TAPS, add_lanes};
+use crate::simd::{ALIGNMENT, Simd, align, prefetch_part};
+
+/// Vectors of positions that all taps run over before the next: 8 channels of 32 vectors of 64 bytes are half of a 32 KiB cache.
+const CHUNK: usize = 32;
+/// Elements of the fewest positions of a strip, so that summing over lanes is a small part of the work.
+const FEWEST_POSITIONS: usize = 768;
+/// The most lanes and channels a tile has on any instruction set.
+const MOST_LANES: usize = 16;
+const MOST_CHANNELS: usize = 8;
+
+/// The weight gradient of one shape.
+#[derive(Clone, Debug)]
+pub(crate) struct WeightGradient {
+    input: InputPoints,
+    taps: Taps,
+}
+
+impl WeightGradient {
+    /// The gradient of `shape`, if it gains.
+    pub fn new(shape: ConvShape) -> Option<WeightGradient> {
+        let strips = |[rows, height, pitch, reach, planes]: [usize; 5]| {
+            Strips::new(rows, height, pitch, reach, |tile| {
+                (GRADIENT_BUDGET / ((rows + 2) * (planes + shape.oc) * tile)).max(FEWEST_POSITIONS.div_ceil(tile))
+            })
+        };
+        let (input, taps) = InputPoints::new(shape, strips)?;
+        // A strip is always this full but where images have few rows.
+        let strips = &input.strips;
+        (strips.images * strips.per_strip * strips.pitch >= 2 * FEWEST_POSITIONS / 3).then_some(WeightGradient { input, taps })
+    }
+
+    /// Elements of the planes of a point of the output's gradient.
+    fn output_stride(&self) -> usize {
+        self.input.shape.oc * self.input.strips.plane
+    }
+
+    /// Elements of the gradients of the filters at one point.
+    fn filters(&self) -> usize {
+        self.input.shape.oc * self.taps.len()
+    }
+
+    /// Elements of [`WeightGradient::run`]'s scratch.
+    pub fn scratch_len(&self) -> usize {
+        let points = self.input.strips.points();
+        let sums = self.taps.len().next_multiple_of(TILE_TAPS) * MOST_CHANNELS * MOST_LANES;
+        self.input.len()
+            + points * (self.output_stride() + self.filters())
+            + sums
+            + self.input.copy_len()
+            + 2 * ALIGNMENT
+    }
+
+    /// Adds the gradients of the images in `dy` to `dweight` and `dbias`.
+    #[inline(always)]
+    pub fn run<S: Simd>(
+        &self,
+        simd: S,
+        x: &[f32],
+        dy: &[f32],
+        dweight: &mut [f32],
+        dbias: &mut [f32],
+        scratch: &mut [f32],
+    ) {
+        match self.input.strips.rows {
+            2 => self.run_tiles::<S, 2>(simd, x, dy, dweight, dbias, scratch),
+            _ => self.run_tiles::<S, 4>(simd, x, dy, dweight, dbias, scratch),
+        }
+    }
+
+    #[inline(always)]
+    fn run_tiles<S: Simd, const M: usize>(
+        &self,
+        simd: S,
+        x: &[f32],
+        dy: &[f32],
+        dweight: &mut [f32],
+        dbias: &mut [f32],
+        scratch: &mut [f32],
+    ) {
+        let InputPoints { shape, strips, .. } = &self.input;
+        let (input, rest) = align(scratch).split_at_mut(self.input.len());
+        let (output, rest) = rest.split_at_mut((M + 2) * self.output_stride());
+        let (gradients, rest) = rest.split_at_mut((M + 2) * self.filters());
+        let (copy, sums) = rest.split_at_mut(self.input.copy_len());
+        let sums = align(sums);
+        gradients.fill(0.0);
+        let (x_group, y_group) = (strips.images * shape.x_len(), strips.images * shape.y_len());
+        for group in 0..dy.len().div_ceil(y_group) {
+            let (x, next_x) = head(&x[group * x_group..], x_group);
+            let (dy, next_dy) = head(&dy[group * y_group..], y_group);
+            let from = self.input.lay_out(simd, x, copy);
+            for strip in strips.of(dy.len() / shape.y_len()) {
+                self.input.of_strip::<S, M>(simd, strip, from, input);
+                strips.output_gradient::<S, M>(simd, strip, [shape.out_h(), shape.out_w()], shape.oc, dy, output);
+                strips.clear_rest(simd, strip, input);
+                strips.clear_rest(simd, strip, output);
+                for point in 0..M + 2 {
+                    let upcoming = match point {
+                        0 => strips.upcoming(strip, head(next_x, x_group).0),
+                        1 => strips.upcoming(strip, head(next_dy, y_group).0),
+                        _ => &[],
+                    };
+                    let input = &input[point * self.input.stride()..][..self.input.stride()];
+                    let output = &output[point * self.output_stride()..][..self.output_stride()];
+                    let gradient = &mut gradients[point * self.filters()..][..self.filters()];
+                    // The taps that have no use for the point come last: those of the shorter filters.
+                    let taps = self.taps.phases.iter().filter(|phase| phase.points.contains(&point));
+                    let taps = taps.map(|phase| phase.taps.end).max().unwrap_or(0);
+                    let dbias = (point == POINT_ONE).then_some(&mut *dbias);
+                    self.sum_at_point(simd, strip, taps, [input, output], gradient, dbias, sums, upcoming);
+                }
+            }
+        }
+        self.add_filters::<M>(gradients, dweight);
+    }
+
+    /// Adds the gradient of the first `taps` taps of the filters at one point, `[oc][taps]`, and of the bias, if this is the
+    /// point whose value is the sum of all rows.
+    #[inline(always)]
+    fn sum_at_point<S: Simd>(
+        &self,
+        simd: S,
+        strip: Strip,
+        taps: usize,
+        points: [&[f32]; 2],
+        gradient: &mut [f32],
+        dbias: Option<&mut [f32]>,
+        sums: &mut [f32],
+        upcoming: &[f32],
+    ) {
+        // The height that leaves the fewest rows empty: 24 or 18 accumulators, or 12 or 9 where there are 16 registers.
+        let heights = if S::MANY_REGISTERS { [8, 6] } else { [4, 3] };
+        let rows = |height: usize| self.input.shape.oc.div_ceil(height) * height;
+        match if rows(heights[0]) <= rows(heights[1]) { heights[0] } else { heights[1] } {
+            8 if S::MANY_REGISTERS => {
+                self.panels::<S, 8>(simd, strip, taps, points, gradient, dbias, sums, upcoming);
+            }
+            6 if S::MANY_REGISTERS => {
+                self.panels::<S, 6>(simd, strip, taps, points, gradient, dbias, sums, upcoming);
+            }
+            4 => self.panels::<S, 4>(simd, strip, taps, points, gradient, dbias, sums, upcoming),
+            _ => self.panels::<S, 3>(simd, strip, taps, points, gradient, dbias, sums, upcoming),
+        }
+    }
+
+    #[inline(always)]
+    fn panels<S: Simd, const MR: usize>(
+        &self,
+        simd: S,
+        strip: Strip,
+        taps: usize,
+        [input, output]: [&[f32]; 2],
+        gradient: &mut [f32],
+        mut dbias: Option<&mut [f32]>,
+        sums: &mut [f32],
+        upcoming: &[f32],
+    ) {
+        let (oc, plane) = (self.input.shape.oc, self.input.strips.plane);
+        let vectors = self.input.strips.used(strip).div_ceil(S::LANES);
+        assert!(MR <= MOST_CHANNELS && S::LANES <= MOST_LANES, "weight gradient: a tile is too large");
+        assert!(vectors * S::LANES + self.taps.farthest() <= input.len(), "weight gradient: too few points");
+        assert!(vectors * S::LANES <= plane && output.len() == oc * plane, "weight gradient: too few points");
+        // A row of vectors, one for each tap, for each channel.
+        let row = taps.next_multiple_of(TILE_TAPS);
+        let sums = &mut sums[..MR * row * S::LANES];
+        let (chunks, groups) = (vectors.div_ceil(CHUNK), row / TILE_TAPS);
+        let parts = oc.div_ceil(MR) * chunks * groups;
+        let mut part = 0;
+        for first in (0..oc).step_by(MR) {
+            let rows = MR.min(oc - first);
+            // Rows beyond the last channel repeat it; their sums are not used.
+            let mut from = [output.as_ptr(); MR];
+            for r in 0..MR {
+                from[r] = output[(first + r.min(rows - 1)) * plane..].as_ptr();
+            }
+            for chunk in (0..vectors).step_by(CHUNK) {
+                let (count, at) = (CHUNK.min(vectors - chunk), chunk * S::LANES);
+                for group in (0..row).step_by(TILE_TAPS) {
+                    prefetch_part(simd, upcoming, part, parts);
+                    part += 1;
+                    let mut shifted = [input.as_ptr(); TILE_TAPS];
+                    for t in 0..TILE_TAPS {
+                        // Taps beyond the last repeat it; their sums are not used.
+                        shifted[t] = input[at + self.taps.offsets[(group + t).min(taps - 1)]..].as_ptr();
+                    }
+                    let sums = sums[group * S::LANES..].as_mut_ptr();
+                    // SAFETY: as asserted, all vectors may be read in full, also at the farthest tap; `sums` has `MR` rows.
+                    unsafe { tile::<S, MR>(simd, shifted, from, at, count, chunk > 0, row, sums) };
+                }
+            }
+            for r in 0..rows {
+                let o = first + r;
+                // SAFETY: `sums` holds a vector for each tap.
+                unsafe {
+                    let sums = sums[r * row * S::LANES..].as_ptr();
+                    add_lanes(simd, sums, &mut gradient[o * self.taps.len()..][..taps]);
+                }
+                if let Some(dbias) = &mut dbias {
+                    let mut sum = simd.splat(0.0);
+                    for vector in 0..vectors {
+                        // SAFETY: a plane holds all vectors.
+                        let values = unsafe { simd.load(from[r].add(vector * S::LANES)) };
+                        sum = simd.mul_add(values, simd.splat(1.0), sum);
+                    }
+                    dbias[o] += simd.sum(sum);
+                }
+            }
+        }
+    }
+
+    /// Makes the gradients of the filters' points into those of the weights, and adds them to `dweight`.
+    #[inline(always)]
+    fn add_filters<const M: usize>(&self, gradients: &[f32], dweight: &mut [f32]) {
+        let taps = self.taps.len();
+        for o in 0..self.input.shape.oc {
+            for phase in &self.taps.phases {
+                for tap in phase.taps.clone() {
+                    let mut points = [0.0; MOST_POINTS];
+                    for (u, point) in points.iter_mut().enumerate().take(M + 2) {
+                        *point = gradients[u * self.filters() + o * taps + tap];
+                    }
+                    let at = o * self.taps.weight_stride + self.taps.weights[tap];
+                    for (gradient, row) in transform::filter_gradient::<M>(points).into_iter().zip(phase.rows) {
+                        if let Some(row) = row {
+                            dweight[at + row] += gradient;
+                        }
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// Adds the products of `MR` channels and three taps over `count` vectors to `sums`, or overwrites them unless `adds`.
+///
+/// # Safety
+/// From each of `shifted`, and each of `from` plus `at`, `count` vectors are readable. `sums` has `TILE_TAPS` vectors at each of
+/// `MR` places `row` vectors apart.
+#[inline(always)]
+unsafe fn tile<S: Simd, const MR: usize>(
+    simd: S,
+    shifted: [*const f32; TILE_TAPS],
+    from: [*const f32; MR],
+    at: usize,
+    count: usize,
+    adds: bool,
+    row: usize,
+    sums: *mut f32,
+) {
+    let mut acc = [[simd.splat(0.0); TILE_TAPS]; MR];
+    // SAFETY: as the caller promises.
+    unsafe {
+        if adds {
+            for r in 0..MR {
+                for t in 0..TILE_TAPS {
+                    acc[r][t] = simd.load(sums.add((r * row + t) * S::LANES));
+                }
+            }
+        }
+        for vector in 0..count {
+            let mut x = [simd.splat(0.0); TILE_TAPS];
+            for t in 0..TILE_TAPS {
+                x[t] = simd.load(shifted[t].add(vector * S::LANES));
+            }
+            for r in 0..MR {
+                let dy = simd.load(from[r].add(at + vector * S::LANES));
+                for t in 0..TILE_TAPS {
+                    acc[r][t] = simd.mul_add(x[t], dy, acc[r][t]);
+                }
+            }
+        }
+        for r in 0..MR {
+            for t in 0..TILE_TAPS {
+                simd.store(sums.add((r * row + t) * S::LANES), acc[r][t]);
+            }
+        }
+    }
+}
