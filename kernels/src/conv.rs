@@ -76,8 +76,7 @@ impl Conv {
             plane: shape.out_pixels(),
         };
         let input_gradient = InputGradient::new(shape, isa);
-        let fast_input_gradient =
-            if input_gradient.by_product() { None } else { winograd::InputGradient::new(shape) };
+        let fast_input_gradient = if input_gradient.by_product() { None } else { winograd::InputGradient::new(shape) };
         Conv {
             shape,
             isa,
@@ -195,7 +194,11 @@ impl Conv {
     /// # Panics
     /// If a slice has another length, or `scratch` less than [`Conv::scratch_len`].
     pub fn backward_input(&self, n: usize, dy: &[f32], weight: &[f32], dx: &mut [f32], scratch: &mut [f32]) {
-        assert!(scratch.len() >= self.scratch_len(), "conv backward_input: scratch must have {} elements", self.scratch_len());
+        assert!(
+            scratch.len() >= self.scratch_len(),
+            "conv backward_input: scratch must have {} elements",
+            self.scratch_len()
+        );
         let (packed, scratch) = scratch.split_at_mut(self.packed_gradient_len());
         self.pack_gradient(weight, packed);
         self.run_packed_gradient(n, dy, packed, dx, scratch);
@@ -216,7 +219,11 @@ impl Conv {
     pub fn pack_gradient(&self, weight: &[f32], packed: &mut [f32]) {
         let shape = &self.shape;
         assert_eq!(weight.len(), shape.oc * shape.taps(), "conv pack_gradient: length of the weights of {shape:?}");
-        assert_eq!(packed.len(), self.packed_gradient_len(), "conv pack_gradient: length of the packed weights of {shape:?}");
+        assert_eq!(
+            packed.len(),
+            self.packed_gradient_len(),
+            "conv pack_gradient: length of the packed weights of {shape:?}"
+        );
         pack_gradient(self.isa, self, weight, packed);
     }
 
@@ -225,8 +232,17 @@ impl Conv {
     /// # Panics
     /// As [`Conv::backward_input`].
     pub fn backward_input_packed(&self, n: usize, dy: &[f32], packed: &[f32], dx: &mut [f32], scratch: &mut [f32]) {
-        assert!(scratch.len() >= self.scratch_len(), "conv backward_input: scratch must have {} elements", self.scratch_len());
-        assert_eq!(packed.len(), self.packed_gradient_len(), "conv backward_input: length of the packed weights of {:?}", self.shape);
+        assert!(
+            scratch.len() >= self.scratch_len(),
+            "conv backward_input: scratch must have {} elements",
+            self.scratch_len()
+        );
+        assert_eq!(
+            packed.len(),
+            self.packed_gradient_len(),
+            "conv backward_input: length of the packed weights of {:?}",
+            self.shape
+        );
         self.run_packed_gradient(n, dy, packed, dx, scratch);
     }
 

@@ -4,8 +4,9 @@
 //! activations, a gradient arena and scratch of its own, and is worked on by one thread; gradients and batch-norm sums are
 //! added in the order of the shards. So the result has the same bits for any number of threads.
 //!
-//! Between two batch-norm barriers a shard goes through all layers in one go. A network without batch norm has no barrier at
-//! all: then a shard takes a few images at a time forward *and* backward, and their activations stay in the cache.
+//! Between two batch-norm barriers a shard takes a few images at a time through all layers, so that what one layer writes is
+//! still in the cache when the next reads it. A network without batch norm has no barrier at all: then a shard takes them
+//! forward *and* backward, and needs buffers for no more of them.
 
 use std::ops::Range;
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -22,6 +23,9 @@ use crate::stopwatch::Stopwatch;
 
 /// Most shards a batch is cut into: enough to keep 16 threads busy.
 pub const MAX_SHARDS: usize = 16;
+
+/// What goes in and out between two barriers for the images that a shard takes at a time, in numbers: about half a MiB.
+const SEGMENT_NUMBERS: usize = 128 * 1024;
 
 /// Activations of the images that a shard takes at a time, in numbers, in networks without a barrier: about 1 MiB.
 const GROUP_NUMBERS: usize = 256 * 1024;
@@ -67,6 +71,8 @@ pub struct TrainingPlan {
     sums: Vec<f64>,
     /// Runs of stages without a barrier inside; each but the first begins with the stage that needs the barrier.
     segments: Vec<Range<usize>>,
+    /// How many images go through each segment at a time.
+    segment_groups: Vec<usize>,
     /// The first stage that learns: below it nobody asks for a gradient.
     first_learning: usize,
     capacity: usize,
@@ -82,8 +88,12 @@ struct Shard {
     buffers: Buffers,
     /// Empty while the shard is not worked on.
     scratch: Vec<f32>,
+    /// The image whose activations come first in the buffers.
+    first: usize,
     gradient: Vec<f32>,
     sums: Vec<f64>,
+    /// The same of the images that are being worked on.
+    group_sums: Vec<f64>,
     /// Sum of the losses of all images.
     loss: f64,
 }
@@ -162,6 +172,10 @@ impl TrainingPlan {
         } else {
             (GROUP_NUMBERS / per_image.max(1)).clamp(MIN_GROUP.min(shard_capacity), shard_capacity)
         };
+        let segment_groups = (0..segments.len())
+            .map(|segment| segment_group(network, &stages, &segments, segment).unwrap_or(shard_capacity))
+            .map(|images| images.min(shard_capacity))
+            .collect();
         let scratch_len = stages.iter().map(|stage| stage.scratch_len(network, group)).max().unwrap_or(0);
         let mut spare: Vec<Buffers> = (0..capacity.min(MAX_SHARDS))
             .map(|_| Buffers {
@@ -178,7 +192,9 @@ impl TrainingPlan {
                 buffers: if segments.len() > 1 { spare.pop().unwrap_or_default() } else { Buffers::default() },
                 scratch: Vec::new(),
                 gradient: vec![0.0; network.count(true)],
+                first: 0,
                 sums: vec![0.0; sums_len],
+                group_sums: vec![0.0; sums_len],
                 loss: 0.0,
             })
             .collect();
@@ -200,6 +216,7 @@ impl TrainingPlan {
             moments_of,
             sums: vec![0.0; sums_len],
             segments,
+            segment_groups,
             capacity,
             isa: network.isa(),
         }
@@ -308,8 +325,8 @@ impl TrainingPlan {
             shard.buffers = spare_buffers.take();
             shard.scratch = spare_scratch.take();
             let group = shard.group_capacity(network);
-            for start in shard.images.clone().step_by(group) {
-                let images = start..(start + group).min(shard.images.end);
+            for images in groups(shard.images.clone(), group) {
+                shard.first = images.start;
                 run.forward(0..stages.len(), shard, images.clone());
                 run.loss(loss, shard, images.clone());
                 run.backward(0..stages.len(), shard, images);
@@ -336,6 +353,7 @@ impl TrainingPlan {
             moments_of,
             sums,
             segments,
+            segment_groups,
             first_learning,
             times,
             ..
@@ -355,11 +373,15 @@ impl TrainingPlan {
                 if index == 0 {
                     shard.reset();
                 }
-                shard.scratch = spare_scratch.take();
-                run.forward(segment.clone(), shard, shard.images.clone());
-                match next_barrier {
-                    Some(stage) => run.forward_sums(stage, barrier(stage), shard),
-                    None => run.loss(loss, shard, shard.images.clone()),
+                shard.begin_segment(spare_scratch);
+                for images in groups(shard.images.clone(), segment_groups[index]) {
+                    run.forward(segment.clone(), shard, images.clone());
+                    if let Some(stage) = next_barrier {
+                        run.forward_sums(stage, barrier(stage), shard, images);
+                    }
+                }
+                if next_barrier.is_none() {
+                    run.loss(loss, shard, shard.images.clone());
                 }
                 spare_scratch.put(std::mem::take(&mut shard.scratch));
             });
@@ -380,14 +402,18 @@ impl TrainingPlan {
             // The stage at the start of a segment waits for the sums over all shards.
             let rest = if index > 0 { segment.start + 1..segment.end } else { segment.clone() };
             shards.par_iter_mut().for_each(|shard| {
-                shard.scratch = spare_scratch.take();
-                if index < last {
-                    let next = segments[index + 1].start;
-                    run.backward(next..next + 1, shard, shard.images.clone());
-                }
-                run.backward(rest.clone(), shard, shard.images.clone());
-                if index > 0 {
-                    run.backward_sums(segment.start, barrier(segment.start), shard);
+                shard.begin_segment(spare_scratch);
+                let in_place = shard.buffers.in_place;
+                for images in groups(shard.images.clone(), segment_groups[index]) {
+                    shard.buffers.in_place = in_place;
+                    if index < last {
+                        let next = segments[index + 1].start;
+                        run.backward(next..next + 1, shard, images.clone());
+                    }
+                    run.backward(rest.clone(), shard, images.clone());
+                    if index > 0 {
+                        run.backward_sums(segment.start, barrier(segment.start), shard, images);
+                    }
                 }
                 spare_scratch.put(std::mem::take(&mut shard.scratch));
             });
@@ -432,6 +458,20 @@ impl Shard {
         self.loss = 0.0;
     }
 
+    /// Takes scratch for the images between two barriers.
+    fn begin_segment(&mut self, spare_scratch: &Spare<Vec<f32>>) {
+        self.scratch = spare_scratch.take();
+        self.first = self.images.start;
+        self.sums.fill(0.0);
+    }
+
+    /// Adds the sums of a group.
+    fn add_group_sums(&mut self, len: usize) {
+        for (sum, group) in self.sums[..len].iter_mut().zip(&self.group_sums) {
+            *sum += group;
+        }
+    }
+
     /// How many images the activations have room for.
     fn group_capacity(&self, network: &Network) -> usize {
         self.buffers.activations.last().map_or(self.images.len(), |last| last.len() / network.output().len()).max(1)
@@ -442,6 +482,23 @@ impl Shard {
         let (before, from_here) = self.buffers.activations.split_at_mut(stage);
         (&mut before[source], &mut from_here[0])
     }
+}
+
+/// `images`, `group` at a time.
+fn groups(images: Range<usize>, group: usize) -> impl Iterator<Item = Range<usize>> {
+    images.clone().step_by(group).map(move |start| start..(start + group).min(images.end))
+}
+
+/// How many images should go through a segment at a time: `None` where they cannot be told apart, because a gradient on the way
+/// back leaves its place among the activations.
+fn segment_group(network: &Network, stages: &[Stage], segments: &[Range<usize>], segment: usize) -> Option<usize> {
+    let stays = |index: usize| stages[index].source.is_none() || replaces_input(network, stages, index);
+    let next = segments.get(segment + 1)?.start;
+    let after_next = next + 1 < stages.len() && replaces_input(network, stages, next + 1);
+    let all_stay = (segments[segment].start + 1..=next).all(stays);
+    let stages = &stages[segments[segment].clone()];
+    let numbers: usize = stages.iter().map(|stage| stage.input_len(network).max(stage.output_len(network))).sum();
+    (after_next && all_stay).then_some((SEGMENT_NUMBERS / numbers.max(1)).max(1))
 }
 
 /// Whether the gradient of the stage's input takes the place of that input.
@@ -501,14 +558,20 @@ impl<'a> Run<'a> {
         &self.parameters.values[self.stages[stage].params(self.network)]
     }
 
-    /// The input of `stage` for `images` of the batch.
-    fn stage_input<'b>(&self, stage: usize, activations: &'b [Vec<f32>], images: Range<usize>) -> &'b [f32]
+    /// The input of `stage` for `images` of the batch; `first` is that whose activations come first.
+    fn stage_input<'b>(
+        &self,
+        stage: usize,
+        activations: &'b [Vec<f32>],
+        first: usize,
+        images: Range<usize>,
+    ) -> &'b [f32]
     where
         'a: 'b,
     {
         let len = self.stages[stage].input_len(self.network);
         match self.stages[stage].source {
-            Some(source) => &activations[source][..images.len() * len],
+            Some(source) => &activations[source][(images.start - first) * len..][..images.len() * len],
             None => &self.input.x[images.start * len..images.end * len],
         }
     }
@@ -517,9 +580,10 @@ impl<'a> Run<'a> {
         for index in stages {
             let stage = &self.stages[index];
             let (before, from_here) = shard.buffers.activations.split_at_mut(index);
-            let x = self.stage_input(index, before, images.clone());
-            let n = images.len();
-            let y = &mut from_here[0][..n * stage.output_len(self.network)];
+            let x = self.stage_input(index, before, shard.first, images.clone());
+            let (n, before) = (images.len(), images.start - shard.first);
+            let outputs = stage.output_len(self.network);
+            let y = &mut from_here[0][before * outputs..][..n * outputs];
             let (params, pass) = (self.params(index), self.pass(index, images.start));
             self.times.stages[index][0].time(|| match &stage.kind {
                 Kind::Layer => {
@@ -528,7 +592,7 @@ impl<'a> Run<'a> {
                 }
                 Kind::NormRectify(fused) => fused.forward(params, &pass, n, x, y),
                 Kind::PooledConv(fused) => {
-                    let places = &mut shard.buffers.places[index][..y.len()];
+                    let places = &mut shard.buffers.places[index][before * outputs..][..n * outputs];
                     fused.forward(&pass, n, x, y, places, &mut shard.scratch);
                 }
             });
@@ -554,7 +618,9 @@ impl<'a> Run<'a> {
         for index in stages.rev().filter(|index| *index >= self.first_learning) {
             let stage = &self.stages[index];
             let n = images.len();
-            let (x_len, y_len) = (n * stage.input_len(self.network), n * stage.output_len(self.network));
+            let before = images.start - shard.first;
+            let place = |len: usize| before * len..(before + n) * len;
+            let (of_x, of_y) = (place(stage.input_len(self.network)), place(stage.output_len(self.network)));
             let (params, pass) = (self.params(index), self.pass(index, images.start));
             let replaces = stage.source.filter(|_| replaces_input(self.network, self.stages, index));
             // Nobody asks for the gradient of the images themselves, or of what comes before all that learns.
@@ -564,37 +630,34 @@ impl<'a> Run<'a> {
                     let source = replaces.expect("batch norm runs fused only after another stage");
                     let (in_place, d_output) = (shard.buffers.in_place, std::mem::take(&mut shard.buffers.d_output));
                     let (x, y) = shard.source_and_output(index, source);
-                    let dy = if in_place { &y[..y_len] } else { &d_output[..y_len] };
-                    fused.backward(params, &pass, n, &mut x[..x_len], dy);
+                    let dy = if in_place { &y[of_y] } else { &d_output[of_y] };
+                    fused.backward(params, &pass, n, &mut x[of_x], dy);
                     shard.buffers.d_output = d_output;
                 }
                 Kind::PooledConv(fused) => {
-                    let x = self.stage_input(index, &shard.buffers.activations, images.clone());
-                    let pair =
-                        Pair { x, y: &shard.buffers.activations[index][..y_len], dy: &shard.buffers.d_output[..y_len] };
-                    let dx = wanted.map(|_| &mut shard.buffers.d_input[..x_len]);
+                    let x = self.stage_input(index, &shard.buffers.activations, shard.first, images.clone());
+                    let y = &shard.buffers.activations[index][of_y.clone()];
+                    let pair = Pair { x, y, dy: &shard.buffers.d_output[of_y.clone()] };
+                    let dx = wanted.map(|_| &mut shard.buffers.d_input[of_x]);
                     let dparams = &mut shard.gradient[stage.params(self.network)];
                     let grads = Grads { dparams, scratch: &mut shard.scratch };
-                    fused.backward(params, n, pair, &shard.buffers.places[index][..y_len], dx, grads);
+                    fused.backward(params, n, pair, &shard.buffers.places[index][of_y], dx, grads);
                 }
                 Kind::Layer => {
                     let layer = &self.network.layers()[stage.layers.start].layer;
-                    let x = self.stage_input(index, &shard.buffers.activations, images.clone());
-                    let y = &shard.buffers.activations[index][..y_len];
-                    let pair =
-                        Pair { x, y, dy: if shard.buffers.in_place { y } else { &shard.buffers.d_output[..y_len] } };
+                    let x = self.stage_input(index, &shard.buffers.activations, shard.first, images.clone());
+                    let y = &shard.buffers.activations[index][of_y.clone()];
+                    let dy = if shard.buffers.in_place { y } else { &shard.buffers.d_output[of_y.clone()] };
+                    let pair = Pair { x, y, dy };
                     let apart = wanted.is_some() && replaces.is_none();
-                    let dx = if apart { Some(&mut shard.buffers.d_input[..x_len]) } else { None };
+                    let dx = if apart { Some(&mut shard.buffers.d_input[of_x.clone()]) } else { None };
                     let dparams = &mut shard.gradient[stage.params(self.network)];
                     layer.backward(params, &pass, n, pair, dx, Grads { dparams, scratch: &mut shard.scratch });
                     if let (Some(linear), Some(source)) = (layer.linear(), replaces.and(wanted)) {
                         let (before, from_here) = shard.buffers.activations.split_at_mut(index);
-                        let dy = if shard.buffers.in_place {
-                            &from_here[0][..y_len]
-                        } else {
-                            &shard.buffers.d_output[..y_len]
-                        };
-                        linear.backward_input(params, &pass, n, dy, &mut before[source][..x_len], &mut shard.scratch);
+                        let dy =
+                            if shard.buffers.in_place { &from_here[0][of_y] } else { &shard.buffers.d_output[of_y] };
+                        linear.backward_input(params, &pass, n, dy, &mut before[source][of_x], &mut shard.scratch);
                     }
                 }
             });
@@ -605,24 +668,28 @@ impl<'a> Run<'a> {
         }
     }
 
-    fn forward_sums(&self, stage: usize, barrier: &dyn BatchStatistics, shard: &mut Shard) {
-        let x = self.stage_input(stage, &shard.buffers.activations, shard.images.clone());
-        let sums = &mut shard.sums[..barrier.sums_len()];
-        self.times.stages[stage][0].time(|| barrier.forward_sums(shard.images.len(), x, sums));
+    /// Adds the sums over the images that the barrier is for to the shard's.
+    fn forward_sums(&self, stage: usize, barrier: &dyn BatchStatistics, shard: &mut Shard, images: Range<usize>) {
+        let x = self.stage_input(stage, &shard.buffers.activations, shard.first, images.clone());
+        let sums = &mut shard.group_sums[..barrier.sums_len()];
+        self.times.stages[stage][0].time(|| barrier.forward_sums(images.len(), x, sums));
+        shard.add_group_sums(barrier.sums_len());
     }
 
-    fn backward_sums(&self, index: usize, barrier: &dyn BatchStatistics, shard: &mut Shard) {
+    /// The same on the way back.
+    fn backward_sums(&self, index: usize, barrier: &dyn BatchStatistics, shard: &mut Shard, images: Range<usize>) {
         let stage = &self.stages[index];
-        let n = shard.images.len();
-        let x = self.stage_input(index, &shard.buffers.activations, shard.images.clone());
-        let y_len = n * stage.output_len(self.network);
+        let n = images.len();
+        let x = self.stage_input(index, &shard.buffers.activations, shard.first, images.clone());
+        let outputs = stage.output_len(self.network);
+        let of_y = (images.start - shard.first) * outputs..(images.end - shard.first) * outputs;
         let dy = if shard.buffers.in_place {
-            &shard.buffers.activations[index][..y_len]
+            &shard.buffers.activations[index][of_y]
         } else {
-            &shard.buffers.d_output[..y_len]
+            &shard.buffers.d_output[of_y]
         };
-        let sums = &mut shard.sums[..barrier.sums_len()];
-        let moments = self.pass(index, shard.images.start).moments;
+        let sums = &mut shard.group_sums[..barrier.sums_len()];
+        let moments = self.pass(index, images.start).moments;
         let dparams = &mut shard.gradient[stage.params(self.network)];
         self.times.stages[index][1].time(|| match &stage.kind {
             Kind::Layer | Kind::PooledConv(_) => barrier.backward_sums(moments, n, x, dy, sums, dparams),

@@ -1,9 +1,9 @@
 //! The forward pass.
 
-use super::{BUDGET, FEWEST_TAPS};
 use super::input_points::InputPoints;
 use super::point_sum::{PointSum, Target};
 use super::strips::{Strips, head};
+use super::{BUDGET, FEWEST_TAPS};
 use crate::conv::ConvShape;
 use crate::simd::{ALIGNMENT, Simd, align};
 

@@ -47,6 +47,8 @@ pub(super) struct InputPoints {
     pub shape: ConvShape,
     pub strips: Strips,
     layout: Layout,
+    /// Whether the stride makes four maps of each, all of which are used, and nothing is padded: no copy is needed then.
+    pairs: bool,
 }
 
 impl InputPoints {
@@ -81,7 +83,9 @@ impl InputPoints {
             });
         }
         let taps = Taps { offsets, weights, weight_stride: shape.taps(), phases };
-        Some((InputPoints { shape, strips, layout }, taps))
+        let padded = shape.pad_top + shape.pad_bottom + shape.pad_left + shape.pad_right > 0;
+        let pairs = !padded && [stride_h, stride_w, row_phases, column_phases] == [2; 4];
+        Some((InputPoints { shape, strips, layout, pairs }, taps))
     }
 
     /// Maps of an image in the layout, which are the planes of a point.
@@ -99,15 +103,20 @@ impl InputPoints {
         self.strips.points() * self.stride()
     }
 
+    /// Whether images are brought into the layout first.
+    fn copies(&self) -> bool {
+        self.layout.copies && !self.pairs
+    }
+
     /// Elements of the images that are brought into the layout.
     pub fn copy_len(&self) -> usize {
-        if self.layout.copies { self.strips.images * self.layout.image() } else { 0 }
+        if self.copies() { self.strips.images * self.layout.image() } else { 0 }
     }
 
     /// Brings a group of images into the layout.
     #[inline(always)]
     pub fn lay_out<'a, S: Simd>(&self, simd: S, x: &'a [f32], copy: &'a mut [f32]) -> &'a [f32] {
-        if !self.layout.copies {
+        if !self.copies() {
             return x;
         }
         let copy = &mut copy[..x.len() / self.shape.x_len() * self.layout.image()];
@@ -118,6 +127,10 @@ impl InputPoints {
     /// The points of a strip of images in the layout.
     #[inline(always)]
     pub fn of_strip<S: Simd, const M: usize>(&self, simd: S, strip: Strip, from: &[f32], points: &mut [f32]) {
+        if self.pairs {
+            let ConvShape { c, h, w, .. } = self.shape;
+            return self.strips.input_of_pairs::<S, M>(simd, strip, [h, w], c, from, points);
+        }
         let maps = Maps { height: self.layout.rows, width: self.layout.pitch, above: 0, left: 0 };
         self.strips.input::<S, M>(simd, strip, maps, self.planes(), from, points);
     }

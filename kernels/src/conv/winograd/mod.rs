@@ -22,9 +22,9 @@ pub(crate) use input_gradient::InputGradient;
 pub(crate) use weight_gradient::WeightGradient;
 
 /// Elements of points in a strip: 512 KiB.
-const BUDGET: usize = 1 << 16;
+const BUDGET: usize = 1 << 17;
 /// The same for the weight gradient, which sums over lanes once a strip: 2 MiB.
-const GRADIENT_BUDGET: usize = 1 << 17;
+const GRADIENT_BUDGET: usize = 1 << 18;
 
 /// The fewest taps of a point at which the forward pass gains: the rows of the output are made at a cost that does not depend
 /// on the taps.

@@ -78,13 +78,7 @@ impl PointSum {
     /// Packs bias (none: 0) and the points of the filters into panels of a tile's channels: the bias, then point by point and
     /// tap by tap the channels.
     #[inline(always)]
-    pub fn pack<S: Simd, const M: usize>(
-        &self,
-        _simd: S,
-        bias: Option<&[f32]>,
-        weight: &[f32],
-        packed: &mut [f32],
-    ) {
+    pub fn pack<S: Simd, const M: usize>(&self, _simd: S, bias: Option<&[f32]>, weight: &[f32], packed: &mut [f32]) {
         let height = tile_height(S::MANY_REGISTERS, self.channels);
         let of_point = self.taps.len() * height;
         let panels = packed.chunks_exact_mut(height + of_point * (M + 2));
@@ -154,7 +148,13 @@ impl PointSum {
             let count = match vectors - next {
                 1 => 1,
                 2 | 4 => 2,
-                _ => if S::MANY_REGISTERS { 3 } else { 2 },
+                _ => {
+                    if S::MANY_REGISTERS {
+                        3
+                    } else {
+                        2
+                    }
+                }
             };
             let place = Column { strips, strip, next };
             match count {
@@ -180,7 +180,7 @@ impl PointSum {
     ) {
         let Column { strips, strip, next } = place;
         assert!(S::LANES <= MOST_LANES, "point sum: vectors are too long");
-                let last = (M + 1) * self.stride + (next + NV) * S::LANES + self.taps.farthest();
+        let last = (M + 1) * self.stride + (next + NV) * S::LANES + self.taps.farthest();
         assert!(last <= points.len(), "point sum: too few points");
         let mut segments = [Segments { list: [Segment::default(); MOST_LANES], count: 0 }; NV];
         for v in 0..NV {
@@ -190,7 +190,9 @@ impl PointSum {
         let plain = self.target.column_step == 1
             && (0..NV).all(|v| {
                 let segment = segments[v].list[0];
-                segment.count == S::LANES && segment.rows == (0, M) && segment.out == segments[0].list[0].out + v * S::LANES
+                segment.count == S::LANES
+                    && segment.rows == (0, M)
+                    && segment.out == segments[0].list[0].out + v * S::LANES
             });
         let taps = self.taps.len();
         for (first, panel) in (0..self.channels).step_by(MR).zip(packed.chunks_exact(MR * (1 + taps * (M + 2)))) {
@@ -289,10 +291,8 @@ impl PointSum {
                     + first
                     + (top - rows.start) * row_step
                     + (from - columns.start) * column_step;
-                let last = out
-                    + (self.channels - 1) * map
-                    + (bottom - 1 - top) * row_step
-                    + (to - 1 - from) * column_step;
+                let last =
+                    out + (self.channels - 1) * map + (bottom - 1 - top) * row_step + (to - 1 - from) * column_step;
                 assert!(last < out_len && segments.count < MOST_LANES, "point sum: the output is too short");
                 segments.list[segments.count] = Segment {
                     lane: at - position + from - column,

@@ -124,6 +124,41 @@ impl Strips {
         }
     }
 
+    /// As [`Strips::input`] with the maps that a stride of 2 makes of those of `from`: `channels` of `height` times `width` in an
+    /// image, each of which is four maps, even rows before odd ones and in these even columns before odd ones.
+    #[inline(always)]
+    pub fn input_of_pairs<S: Simd, const M: usize>(
+        &self,
+        simd: S,
+        strip: Strip,
+        [height, width]: [usize; 2],
+        channels: usize,
+        from: &[f32],
+        points: &mut [f32],
+    ) {
+        let stride = 4 * channels * self.plane;
+        for channel in 0..channels {
+            for image in 0..strip.images {
+                let from = &from[(image * channels + channel) * height * width..][..height * width];
+                for tile in 0..strip.tiles {
+                    let at = self.position(strip, image, tile);
+                    for odd in 0..2 {
+                        let top = 2 * (strip.first_tile + tile) * M + odd;
+                        let rows = height.saturating_sub(top).div_ceil(2).min(M + 2);
+                        let to = &mut points[(4 * channel + 2 * odd) * self.plane + at..];
+                        let from = &from[top.min(height) * width..];
+                        // A number known to be all needs no tests.
+                        if rows == M + 2 {
+                            pairs_tile::<S, M>(simd, from, width, M + 2, [self.pitch, self.plane, stride], to);
+                        } else {
+                            pairs_tile::<S, M>(simd, from, width, rows, [self.pitch, self.plane, stride], to);
+                        }
+                    }
+                }
+            }
+        }
+    }
+
     /// The points of the gradient `dy` of the output, whose images are `per_image` maps of `height` times `width` each,
     /// into planes `[point][per_image][plane]`, 0 between the tiles.
     #[inline(always)]
@@ -227,6 +262,49 @@ fn input_tile<S: Simd, const M: usize>(
             let p = transform::input::<S, M>(simd, d);
             for u in 0..M + 2 {
                 simd.store_first(to.as_mut_ptr().add(u * stride + whole), p[u], count);
+            }
+        }
+    }
+}
+
+/// The points of one tile of each of two maps, `plane` apart: that of the even columns and that of the odd ones of every second
+/// row of `from`, of which there are `rows`. Maps have `pitch` columns; what `from` has not is 0.
+#[inline(always)]
+fn pairs_tile<S: Simd, const M: usize>(
+    simd: S,
+    from: &[f32],
+    width: usize,
+    rows: usize,
+    [pitch, plane, stride]: [usize; 3],
+    to: &mut [f32],
+) {
+    assert!(rows <= M + 2 && (rows == 0 || from.len() >= (2 * rows - 1) * width), "winograd: a row is missing");
+    assert!(to.len() >= (M + 1) * stride + plane + pitch, "winograd: too little room for the points");
+    for column in (0..pitch).step_by(S::LANES) {
+        let there = width.saturating_sub(2 * column);
+        let mut d = [[simd.splat(0.0); MOST_POINTS]; 2];
+        for i in 0..rows {
+            // SAFETY: a row of `from` has as many elements as are there, and `ends` has room for two vectors.
+            let [even, odd] = unsafe {
+                let from = from.as_ptr().add(2 * i * width + 2 * column);
+                if there >= 2 * S::LANES {
+                    simd.load_pairs(from)
+                } else {
+                    let mut ends = [0.0; 2 * MOST_LANES];
+                    simd.store(ends.as_mut_ptr(), simd.load_first(from, there.min(S::LANES)));
+                    let rest = there.saturating_sub(S::LANES);
+                    simd.store(ends.as_mut_ptr().add(S::LANES), simd.load_first(from.wrapping_add(S::LANES), rest));
+                    simd.load_pairs(ends.as_ptr())
+                }
+            };
+            (d[0][i], d[1][i]) = (even, odd);
+        }
+        let count = S::LANES.min(pitch - column);
+        for (map, d) in d.into_iter().enumerate() {
+            let p = transform::input::<S, M>(simd, d);
+            for u in 0..M + 2 {
+                // SAFETY: `to` has `pitch` elements of each point of both maps.
+                unsafe { simd.store_first(to.as_mut_ptr().add(u * stride + map * plane + column), p[u], count) };
             }
         }
     }

@@ -99,14 +99,7 @@ pub(super) fn filter<const M: usize>(g: [f32; 3]) -> [f32; MOST_POINTS] {
     } else {
         let (wide, twice) = (g[0] + 4.0 * g[2], 2.0 * g[1]);
         let (near, far) = (-1.0 / 6.0, 1.0 / 24.0);
-        [
-            g[0] * 0.25,
-            (outer + g[1]) * near,
-            (outer - g[1]) * near,
-            (wide + twice) * far,
-            (wide - twice) * far,
-            g[2],
-        ]
+        [g[0] * 0.25, (outer + g[1]) * near, (outer - g[1]) * near, (wide + twice) * far, (wide - twice) * far, g[2]]
     }
 }
 

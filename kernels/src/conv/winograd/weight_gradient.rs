@@ -13,7 +13,7 @@ use crate::conv::weight_gradient::{TILE_TAPS, add_lanes};
 use crate::simd::{ALIGNMENT, Simd, align, prefetch_part};
 
 /// Vectors of positions that all taps run over before the next: 8 channels of 32 vectors of 64 bytes are half of a 32 KiB cache.
-const CHUNK: usize = 32;
+const CHUNK: usize = 48;
 /// Elements of the fewest positions of a strip, so that summing over lanes is a small part of the work.
 const FEWEST_POSITIONS: usize = 768;
 /// The most lanes and channels a tile has on any instruction set.
@@ -38,7 +38,7 @@ impl WeightGradient {
         let (input, taps) = InputPoints::new(shape, strips)?;
         // A strip is always this full but where images have few rows.
         let strips = &input.strips;
-        (strips.images * strips.per_strip * strips.pitch >= 2 * FEWEST_POSITIONS / 3).then_some(WeightGradient { input, taps })
+        (strips.images * strips.per_strip * strips.pitch >= 512).then_some(WeightGradient { input, taps })
     }
 
     /// Elements of the planes of a point of the output's gradient.
