@@ -2,6 +2,8 @@
 //!
 //! Sums are taken in `f64`: the variance is a difference of two sums, and several shards of a batch are added up.
 
+use crate::simd::{Simd, get};
+
 /// Values that are summed side by side, so that a sum vectorises and still has a fixed order.
 const WIDTH: usize = 16;
 
@@ -13,20 +15,43 @@ fn add_block(sums: &mut [f64; WIDTH], block: [f32; WIDTH]) {
     }
 }
 
-/// The sum of a plane and the sum of its squares.
+/// Vectors that are summed in single precision before their sum is added up in double.
+const STRIP: usize = 32;
+
+/// The sum of a plane and the sum of its squares. The first element is taken away from all others before they are
+/// summed, so that the squares of what deviates little from a large mean are exact enough in single precision, and those
+/// of a plane of one value 0.
 #[inline(always)]
-fn plane_sums(x: &[f32]) -> (f64, f64) {
-    let (mut sum, mut squares) = ([0.0f64; WIDTH], [0.0f64; WIDTH]);
-    let (blocks, rest) = x.as_chunks::<WIDTH>();
-    let mut last = [0.0; WIDTH];
-    last[..rest.len()].copy_from_slice(rest);
-    for x in blocks.iter().chain([&last]) {
-        add_block(&mut sum, *x);
-        for i in 0..WIDTH {
-            squares[i] += f64::from(x[i]) * f64::from(x[i]);
+fn plane_sums<S: Simd>(simd: S, x: &[f32]) -> (f64, f64) {
+    let Some(&origin) = x.first() else { return (0.0, 0.0) };
+    let (zero, one, minus) = (simd.splat(0.0), simd.splat(1.0), simd.splat(-origin));
+    let (mut sum, mut squares) = (0.0, 0.0);
+    let whole = x.len() - x.len() % S::LANES;
+    for start in (0..whole).step_by(4 * STRIP * S::LANES) {
+        let strip = &x[start..whole.min(start + 4 * STRIP * S::LANES)];
+        // Side by side: an addition would wait for the one before.
+        let (mut sums, mut sums_of_squares) = ([zero; 4], [zero; 4]);
+        for at in (0..strip.len()).step_by(4 * S::LANES) {
+            for i in 0..4 {
+                if at + i * S::LANES < strip.len() {
+                    let x = simd.mul_add(get(simd, strip, at + i * S::LANES), one, minus);
+                    sums[i] = simd.mul_add(x, one, sums[i]);
+                    sums_of_squares[i] = simd.mul_add(x, x, sums_of_squares[i]);
+                }
+            }
+        }
+        for i in 0..4 {
+            sum += f64::from(simd.sum(sums[i]));
+            squares += f64::from(simd.sum(sums_of_squares[i]));
         }
     }
-    (sum.iter().sum(), squares.iter().sum())
+    for x in &x[whole..] {
+        let x = f64::from(x - origin);
+        sum += x;
+        squares += x * x;
+    }
+    let (origin, count) = (f64::from(origin), x.len() as f64);
+    (sum + count * origin, squares + origin * (2.0 * sum + count * origin))
 }
 
 /// The sum of a plane of `dy` and the sum of its products with the normalised `x`.
@@ -56,14 +81,14 @@ fn plane_backward_sums(x: &[f32], dy: &[f32], mean: f32, inv_std: f32) -> (f64, 
 
 per_isa! {
     /// Adds the sum of each channel of `x` to `sums[..c]` and the sum of its squares to `sums[c..]`.
-    pub fn channel_sums<S>(_simd: S, n: usize, c: usize, hw: usize, x: &[f32], sums: &mut [f64]) {
+    pub fn channel_sums<S>(simd: S, n: usize, c: usize, hw: usize, x: &[f32], sums: &mut [f64]) {
         assert_eq!(x.len(), n * c * hw, "channel_sums: x is not [n][c][hw]");
         assert_eq!(sums.len(), 2 * c, "channel_sums: sums is not 2 c long");
         let (sum, squares) = sums.split_at_mut(c);
         for image in 0..n {
             for channel in 0..c {
                 let plane = &x[(image * c + channel) * hw..][..hw];
-                let (a, b) = plane_sums(plane);
+                let (a, b) = plane_sums(simd, plane);
                 sum[channel] += a;
                 squares[channel] += b;
             }

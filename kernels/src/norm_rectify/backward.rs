@@ -1,15 +1,12 @@
 //! The gradient, in two passes over `x`.
 
-use super::{ChannelMeans, ChannelStatistics, RectifyShape, Slopes};
-use crate::simd::{Simd, get, get_pairs, put, put_pairs};
+use super::{
+    ChannelMeans, ChannelStatistics, EACH, ONE, RectifyShape, Slopes, ZERO, get_windows, largest, prefetch_windows,
+};
+use crate::simd::{Simd, get_first, put_first, put_pairs};
 
-/// Elements that are summed in single precision before their sum is added up in double.
-const STRIP: usize = 512;
-
-/// How the slopes of a row are found: none, one for all, or a list.
-const ZERO: u8 = 0;
-const ONE: u8 = 1;
-const EACH: u8 = 2;
+/// Vectors that are summed in single precision before their sum is added up in double.
+const STRIP: usize = 32;
 
 /// What the gradient of one channel needs.
 #[derive(Clone, Copy)]
@@ -38,246 +35,269 @@ struct Rows<'a> {
     below: &'a [f32],
 }
 
-#[inline(always)]
-fn larger<S: Simd>(simd: S, a: S::V, b: S::V) -> S::V {
-    simd.select_greater(a, b, a, b)
-}
-
-/// `dz` of the four values of each of `LANES` windows: the first largest in row-major order gets `dy` times the slope it
-/// has there. `z` are the normalised values, `slopes` theirs. Also the gradients of the slopes.
-#[inline(always)]
-fn window_gradient<S: Simd, const SLOPES: u8>(
-    simd: S,
+/// What goes into the rectifier, and what comes out.
+struct Windows<S: Simd> {
     z: [S::V; 4],
     slopes: [S::V; 4],
-    dy: S::V,
-) -> ([S::V; 4], [S::V; 4]) {
-    let zero = simd.splat(0.0);
-    let mut f = z;
-    for i in 0..4 {
-        let negative = if SLOPES == ZERO { zero } else { simd.mul_add(z[i], slopes[i], zero) };
-        f[i] = simd.select_greater(z[i], zero, z[i], negative);
-    }
-    let most = larger(simd, larger(simd, f[0], f[1]), larger(simd, f[2], f[3]));
-    let (mut dz, mut dslopes, mut left) = ([zero; 4], [zero; 4], dy);
-    for i in 0..4 {
-        let taken = simd.select_equal(f[i], most, left, zero);
-        left = simd.select_equal(f[i], most, zero, left);
-        let negative = if SLOPES == ZERO { zero } else { simd.mul_add(taken, slopes[i], zero) };
-        dz[i] = simd.select_greater(z[i], zero, taken, negative);
-        if SLOPES != ZERO {
-            dslopes[i] = simd.select_greater(z[i], zero, zero, simd.mul_add(z[i], taken, zero));
+    f: [S::V; 4],
+    most: S::V,
+}
+
+impl<S: Simd> Windows<S> {
+    /// Of the windows whose values are `x`.
+    #[inline(always)]
+    fn new<const SLOPES: u8>(simd: S, line: &Line, x: [S::V; 4], rows: Rows, at: usize, count: usize) -> Windows<S> {
+        let (scale, shift) = (simd.splat(line.scale), simd.splat(line.shift));
+        let mut z = x;
+        for i in 0..4 {
+            z[i] = simd.mul_add(x[i], scale, shift);
         }
+        let slopes = if SLOPES == EACH {
+            get_windows(simd, [rows.above, rows.below], at, count)
+        } else {
+            [simd.splat(line.slope); 4]
+        };
+        let (f, most) = largest::<S, SLOPES>(simd, z, slopes);
+        Windows { z, slopes, f, most }
     }
-    (dz, dslopes)
+
+    /// Which windows have a gradient at all.
+    #[inline(always)]
+    fn live<const SLOPES: u8>(&self, simd: S) -> S::M {
+        // The second is false for NaN only.
+        if SLOPES == ZERO { simd.greater(self.most, simd.splat(0.0)) } else { simd.equal(self.most, self.most) }
+    }
+
+    /// Where in each window the first largest is, in row-major order, if it is live.
+    #[inline(always)]
+    fn places<const SLOPES: u8>(&self, simd: S) -> [S::M; 4] {
+        let mut left = self.live::<SLOPES>(simd);
+        let mut places = [left; 4];
+        for i in 0..3 {
+            places[i] = simd.and(left, simd.equal(self.f[i], self.most));
+            left = simd.and_not(left, places[i]);
+        }
+        places[3] = left;
+        places
+    }
+
+    /// Of four values for each window the one that belongs to the first largest.
+    #[inline(always)]
+    fn choose(&self, simd: S, values: [S::V; 4]) -> S::V {
+        let mut chosen = values[3];
+        for i in [2, 1, 0] {
+            chosen = simd.select(simd.equal(self.f[i], self.most), values[i], chosen);
+        }
+        chosen
+    }
+
+    /// The gradient of the first largest `z`, and that of its slope.
+    #[inline(always)]
+    fn gradient<const SLOPES: u8>(&self, simd: S, dy: S::V) -> (S::V, S::V) {
+        let zero = simd.splat(0.0);
+        if SLOPES == ZERO {
+            return (simd.select(self.live::<SLOPES>(simd), dy, zero), zero);
+        }
+        let z = self.choose(simd, self.z);
+        let slope = if SLOPES == EACH { self.choose(simd, self.slopes) } else { self.slopes[0] };
+        gradient(simd, z, slope, dy)
+    }
 }
 
-/// The slopes of `LANES` windows from window `at` on.
+/// The gradient of `z` and that of the slope, of a rectifier with slopes.
 #[inline(always)]
-fn window_slopes<S: Simd, const SLOPES: u8>(simd: S, line: &Line, rows: Rows, at: usize) -> [S::V; 4] {
-    if SLOPES == EACH {
-        let ([a, b], [c, d]) = (get_pairs(simd, rows.above, 2 * at), get_pairs(simd, rows.below, 2 * at));
-        [a, b, c, d]
-    } else {
-        [simd.splat(line.slope); 4]
-    }
+fn gradient<S: Simd>(simd: S, z: S::V, slope: S::V, dy: S::V) -> (S::V, S::V) {
+    let zero = simd.splat(0.0);
+    let positive = simd.greater(z, zero);
+    let dz = simd.select(positive, dy, simd.mul_add(slope, dy, zero));
+    (dz, simd.select(positive, zero, simd.mul_add(z, dy, zero)))
 }
 
-/// Adds the sums of `LANES` windows from window `at` on.
+/// Adds the sums of the `count` windows from window `at` on; gives the new gradients of their slopes, if each has one.
 #[inline(always)]
 fn sum_windows<S: Simd, const SLOPES: u8>(
     simd: S,
     line: &Line,
     x: [&[f32]; 2],
     rows: Rows,
-    dslopes: [&mut [f32]; 2],
+    dslopes: [&[f32]; 2],
     at: usize,
+    count: usize,
     sums: &mut Sums<S>,
-) {
-    let (scale, shift) = (simd.splat(line.scale), simd.splat(line.shift));
-    let ([a, b], [c, d]) = (get_pairs(simd, x[0], 2 * at), get_pairs(simd, x[1], 2 * at));
-    let x = [a, b, c, d];
-    let mut z = x;
-    for i in 0..4 {
-        z[i] = simd.mul_add(x[i], scale, shift);
+) -> [S::V; 4] {
+    let x = get_windows(simd, x, at, count);
+    let windows = Windows::new::<SLOPES>(simd, line, x, rows, at, count);
+    // Windows that do not exist have no `dy`, so they add nothing.
+    let (dz, of_slope) = windows.gradient::<SLOPES>(simd, get_first(simd, rows.dy, at, count));
+    add::<S, SLOPES>(simd, line, windows.choose(simd, x), dz, of_slope, sums);
+    if SLOPES != EACH {
+        return x;
     }
-    let slopes = window_slopes::<S, SLOPES>(simd, line, rows, at);
-    let (dz, of_slopes) = window_gradient::<S, SLOPES>(simd, z, slopes, get(simd, rows.dy, at));
+    let mut new = get_windows(simd, dslopes, at, count);
+    let places = windows.places::<SLOPES>(simd);
+    for i in 0..4 {
+        new[i] = simd.select(places[i], simd.mul_add(of_slope, simd.splat(1.0), new[i]), new[i]);
+    }
+    new
+}
+
+/// Adds to the sums what belongs to `x`.
+#[inline(always)]
+fn add<S: Simd, const SLOPES: u8>(simd: S, line: &Line, x: S::V, dz: S::V, of_slope: S::V, sums: &mut Sums<S>) {
     let one = simd.splat(1.0);
-    for i in 0..4 {
-        sums[0] = simd.mul_add(dz[i], one, sums[0]);
-        sums[1] = simd.mul_add(dz[i], simd.mul_add(x[i], one, simd.splat(-line.mean)), sums[1]);
-        if SLOPES == ONE {
-            sums[2] = simd.mul_add(of_slopes[i], one, sums[2]);
-        }
-    }
-    if SLOPES == EACH {
-        for (row, dslopes) in dslopes.into_iter().enumerate() {
-            let mut new = get_pairs(simd, dslopes, 2 * at);
-            for i in 0..2 {
-                new[i] = simd.mul_add(of_slopes[2 * row + i], one, new[i]);
-            }
-            put_pairs(simd, dslopes, 2 * at, new);
-        }
+    sums[0] = simd.mul_add(dz, one, sums[0]);
+    sums[1] = simd.mul_add(dz, simd.mul_add(x, one, simd.splat(-line.mean)), sums[1]);
+    if SLOPES == ONE {
+        sums[2] = simd.mul_add(of_slope, one, sums[2]);
     }
 }
 
-/// The gradient of the values of `LANES` windows from window `at` on.
+/// The gradient of the values of the `count` windows from window `at` on.
 #[inline(always)]
-fn of_windows<S: Simd, const SLOPES: u8>(simd: S, line: &Line, x: [&[f32]; 2], rows: Rows, at: usize) -> [S::V; 4] {
-    let (scale, shift) = (simd.splat(line.scale), simd.splat(line.shift));
-    let ([a, b], [c, d]) = (get_pairs(simd, x[0], 2 * at), get_pairs(simd, x[1], 2 * at));
-    let mut values = [a, b, c, d];
-    let mut z = values;
-    for i in 0..4 {
-        z[i] = simd.mul_add(values[i], scale, shift);
-    }
-    let slopes = window_slopes::<S, SLOPES>(simd, line, rows, at);
-    let (dz, _) = window_gradient::<S, SLOPES>(simd, z, slopes, get(simd, rows.dy, at));
-    let (gain, slope_x, offset) = (simd.splat(line.gain), simd.splat(line.slope_x), simd.splat(line.offset));
-    for i in 0..4 {
-        values[i] = simd.mul_add(dz[i], gain, simd.mul_add(values[i], slope_x, offset));
-    }
-    values
-}
-
-/// Writes the values of `LANES` windows from window `at` on.
-#[inline(always)]
-fn put_windows<S: Simd>(simd: S, to: [&mut [f32]; 2], at: usize, v: [S::V; 4]) {
-    let [above, below] = to;
-    put_pairs(simd, above, 2 * at, [v[0], v[1]]);
-    put_pairs(simd, below, 2 * at, [v[2], v[3]]);
-}
-
-/// `dz` of `LANES` elements from `at` on, without pooling, and the gradient of their slopes.
-#[inline(always)]
-fn row_gradient<S: Simd, const SLOPES: u8>(simd: S, line: &Line, x: S::V, rows: Rows, at: usize) -> (S::V, S::V) {
-    let zero = simd.splat(0.0);
-    let z = simd.mul_add(x, simd.splat(line.scale), simd.splat(line.shift));
-    let dy = get(simd, rows.dy, at);
-    if SLOPES == ZERO {
-        return (simd.select_greater(z, zero, dy, zero), zero);
-    }
-    let slope = if SLOPES == EACH { get(simd, rows.above, at) } else { simd.splat(line.slope) };
-    let dz = simd.select_greater(z, zero, dy, simd.mul_add(slope, dy, zero));
-    (dz, simd.select_greater(z, zero, zero, simd.mul_add(z, dy, zero)))
-}
-
-/// Elements of a row that a block may hang over its end by, at most.
-const MOST: usize = 32;
-
-/// The end of a row, filled up with zeros to whole vectors.
-#[inline(always)]
-fn filled(from: &[f32], at: usize) -> [f32; MOST] {
-    let mut to = [0.0; MOST];
-    if at < from.len() {
-        to[..from.len() - at].copy_from_slice(&from[at..]);
-    }
-    to
-}
-
-/// The sums of `dz`, of `dz (x - mean)` and of the gradient of a single slope over a row of windows.
-#[inline(always)]
-fn sums_of_windows<S: Simd, const SLOPES: u8>(
+fn of_windows<S: Simd, const SLOPES: u8>(
     simd: S,
     line: &Line,
     x: [&[f32]; 2],
     rows: Rows,
-    dslopes: [&mut [f32]; 2],
-) -> [f64; 3] {
-    let mut sums = [simd.splat(0.0); 3];
-    let whole = rows.dy.len() - rows.dy.len() % S::LANES;
-    let [above, below] = dslopes;
-    for at in (0..whole).step_by(S::LANES) {
-        sum_windows::<S, SLOPES>(simd, line, x, rows, [&mut *above, &mut *below], at, &mut sums);
+    at: usize,
+    count: usize,
+) -> [S::V; 4] {
+    let mut x = get_windows(simd, x, at, count);
+    let windows = Windows::new::<SLOPES>(simd, line, x, rows, at, count);
+    let dy = get_first(simd, rows.dy, at, count);
+    // Where a window of ReLU has no gradient, none of its places is taken.
+    let dz = if SLOPES == ZERO { dy } else { windows.gradient::<SLOPES>(simd, dy).0 };
+    let places = windows.places::<SLOPES>(simd);
+    let (zero, one) = (simd.splat(0.0), simd.splat(1.0));
+    let (slope_x, offset) = (simd.splat(line.slope_x), simd.splat(line.offset));
+    let dz = simd.mul_add(dz, simd.splat(line.gain), zero);
+    for i in 0..4 {
+        let rest = simd.mul_add(x[i], slope_x, offset);
+        x[i] = simd.select(places[i], simd.mul_add(dz, one, rest), rest);
     }
-    let count = rows.dy.len() - whole;
-    if count > 0 && whole > 0 {
-        // A last vector that reaches back over windows that are done, whose `dy` is left out.
-        let at = rows.dy.len() - S::LANES;
-        let mut dy = [0.0; MOST];
-        dy[S::LANES - count..S::LANES].copy_from_slice(&rows.dy[whole..]);
-        let slopes = |all: &'_ [f32]| if SLOPES == EACH { 2 * at..all.len() } else { 0..0 };
-        let (range_above, range_below) = (slopes(above), slopes(below));
-        let rest = Rows { dy: &dy, above: &rows.above[range_above.clone()], below: &rows.below[range_below.clone()] };
-        let x = [&x[0][2 * at..], &x[1][2 * at..]];
-        let dslopes = [&mut above[range_above], &mut below[range_below]];
-        sum_windows::<S, SLOPES>(simd, line, x, rest, dslopes, 0, &mut sums);
-    } else if count > 0 {
-        // Windows that do not exist have no `dy`, so they add nothing.
-        let end = 2 * rows.dy.len();
-        let x = [filled(&x[0][..end], 2 * whole), filled(&x[1][..end], 2 * whole)];
-        let slopes = [filled(rows.above, 2 * whole), filled(rows.below, 2 * whole)];
-        let dy = filled(rows.dy, whole);
-        let rest = Rows { dy: &dy, above: &slopes[0], below: &slopes[1] };
-        let mut of_slopes = [filled(above, 2 * whole), filled(below, 2 * whole)];
-        let [a, b] = &mut of_slopes;
-        sum_windows::<S, SLOPES>(simd, line, [&x[0], &x[1]], rest, [a, b], 0, &mut sums);
-        if SLOPES == EACH {
-            let count = end - 2 * whole;
-            above[2 * whole..end].copy_from_slice(&of_slopes[0][..count]);
-            below[2 * whole..end].copy_from_slice(&of_slopes[1][..count]);
-        }
-    }
-    sums.map(|sum| f64::from(simd.sum(sum)))
+    x
 }
 
-/// The same over a row without pooling.
+/// Writes the values of the `count` windows from window `at` on.
 #[inline(always)]
-fn sums_of_row<S: Simd, const SLOPES: u8>(
+fn put_windows<S: Simd>(simd: S, rows: [&mut [f32]; 2], at: usize, v: [S::V; 4], count: usize) {
+    let [above, below] = rows;
+    put_pairs(simd, above, 2 * at, [v[0], v[1]], count);
+    put_pairs(simd, below, 2 * at, [v[2], v[3]], count);
+}
+
+/// `dz` of the `count` elements from `at` on, without pooling, and the gradient of their slopes.
+#[inline(always)]
+fn row_gradient<S: Simd, const SLOPES: u8>(
+    simd: S,
+    line: &Line,
+    x: S::V,
+    rows: Rows,
+    at: usize,
+    count: usize,
+) -> (S::V, S::V) {
+    let zero = simd.splat(0.0);
+    let z = simd.mul_add(x, simd.splat(line.scale), simd.splat(line.shift));
+    let dy = get_first(simd, rows.dy, at, count);
+    if SLOPES == ZERO {
+        return (simd.select_greater(z, zero, dy, zero), zero);
+    }
+    let slope = if SLOPES == EACH { get_first(simd, rows.above, at, count) } else { simd.splat(line.slope) };
+    gradient(simd, z, slope, dy)
+}
+
+/// Adds the sums of the `count` elements from `at` on, without pooling.
+#[inline(always)]
+fn sum_elements<S: Simd, const SLOPES: u8>(
     simd: S,
     line: &Line,
     x: &[f32],
     rows: Rows,
     dslopes: &mut [f32],
-) -> [f64; 3] {
+    at: usize,
+    count: usize,
+    sums: &mut Sums<S>,
+) {
+    let x = get_first(simd, x, at, count);
+    let (dz, of_slope) = row_gradient::<S, SLOPES>(simd, line, x, rows, at, count);
+    add::<S, SLOPES>(simd, line, x, dz, of_slope, sums);
+    if SLOPES == EACH {
+        let old = get_first(simd, dslopes, at, count);
+        put_first(simd, dslopes, at, simd.mul_add(of_slope, simd.splat(1.0), old), count);
+    }
+}
+
+/// Sums of a plane.
+struct Totals<S: Simd> {
+    /// Of the strip under way.
+    strip: Sums<S>,
+    /// Of those before.
+    done: [f64; 3],
+}
+
+impl<S: Simd> Totals<S> {
     #[inline(always)]
-    fn block<S: Simd, const SLOPES: u8>(
-        simd: S,
-        line: &Line,
-        x: &[f32],
-        rows: Rows,
-        dslopes: &mut [f32],
-        at: usize,
-        sums: &mut Sums<S>,
-    ) {
-        let (x, one) = (get(simd, x, at), simd.splat(1.0));
-        let (dz, of_slope) = row_gradient::<S, SLOPES>(simd, line, x, rows, at);
-        sums[0] = simd.mul_add(dz, one, sums[0]);
-        sums[1] = simd.mul_add(dz, simd.mul_add(x, one, simd.splat(-line.mean)), sums[1]);
-        if SLOPES == ONE {
-            sums[2] = simd.mul_add(of_slope, one, sums[2]);
-        }
-        if SLOPES == EACH {
-            let old = get(simd, dslopes, at);
-            put(simd, dslopes, at, simd.mul_add(of_slope, one, old));
+    fn new(simd: S) -> Totals<S> {
+        Totals { strip: [simd.splat(0.0); 3], done: [0.0; 3] }
+    }
+
+    #[inline(always)]
+    fn end_strip<const SLOPES: u8>(&mut self, simd: S) {
+        for i in 0..if SLOPES == ONE { 3 } else { 2 } {
+            self.done[i] += f64::from(simd.sum(self.strip[i]));
+            self.strip[i] = simd.splat(0.0);
         }
     }
-    let mut totals = [0.0; 3];
-    let whole = x.len() - x.len() % S::LANES;
-    // So many that single precision suffices for the sums of a strip.
-    for strip in (0..whole).step_by(STRIP) {
-        let mut sums = [simd.splat(0.0); 3];
-        for at in (strip..whole.min(strip + STRIP)).step_by(S::LANES) {
-            block::<S, SLOPES>(simd, line, x, rows, dslopes, at, &mut sums);
+
+    /// Adds the sums over a row of windows.
+    #[inline(always)]
+    fn add_windows<const SLOPES: u8>(&mut self, simd: S, line: &Line, x: &[f32], rows: Rows, dslopes: [&mut [f32]; 2]) {
+        let x_rows: [&[f32]; 2] = x.split_at(x.len() / 2).into();
+        let [above, below] = dslopes;
+        let whole = rows.dy.len() - rows.dy.len() % S::LANES;
+        let rest = rows.dy.len() - whole;
+        // First, and written last: see `Line::windows`.
+        let mut last = [simd.splat(0.0); 4];
+        if rest > 0 {
+            last = sum_windows::<S, SLOPES>(simd, line, x_rows, rows, [above, below], whole, rest, &mut self.strip);
         }
-        for (total, sum) in totals.iter_mut().zip(sums) {
-            *total += f64::from(simd.sum(sum));
+        for at in (0..whole).step_by(S::LANES) {
+            prefetch_windows(simd, x.as_ptr(), at);
+            let old = [&*above, &*below];
+            let new = sum_windows::<S, SLOPES>(simd, line, x_rows, rows, old, at, S::LANES, &mut self.strip);
+            if SLOPES == EACH {
+                put_windows(simd, [&mut *above, &mut *below], at, new, S::LANES);
+            }
+        }
+        if SLOPES == EACH && rest > 0 {
+            put_windows(simd, [above, below], whole, last, rest);
         }
     }
-    if whole < x.len() {
-        let mut sums = [simd.splat(0.0); 3];
-        let (dy, above, mut of_slopes) = (filled(rows.dy, whole), filled(rows.above, whole), filled(dslopes, whole));
-        let rest = Rows { dy: &dy, above: &above, below: &[] };
-        block::<S, SLOPES>(simd, line, &filled(x, whole), rest, &mut of_slopes, 0, &mut sums);
-        if SLOPES == EACH {
-            dslopes[whole..].copy_from_slice(&of_slopes[..x.len() - whole]);
+
+    /// Adds the sums over a plane without pooling.
+    #[inline(always)]
+    fn add_plane<const SLOPES: u8>(&mut self, simd: S, line: &Line, x: &[f32], rows: Rows, dslopes: &mut [f32]) {
+        let whole = x.len() - x.len() % S::LANES;
+        for strip in (0..whole).step_by(2 * STRIP * S::LANES) {
+            let end = whole.min(strip + 2 * STRIP * S::LANES);
+            // Two sums side by side: an addition would wait for the one before.
+            let mut other = Totals::new(simd).strip;
+            for at in (strip..end).step_by(2 * S::LANES) {
+                sum_elements::<S, SLOPES>(simd, line, x, rows, dslopes, at, S::LANES, &mut self.strip);
+                if at + S::LANES < end {
+                    sum_elements::<S, SLOPES>(simd, line, x, rows, dslopes, at + S::LANES, S::LANES, &mut other);
+                }
+            }
+            for (sum, other) in self.strip.iter_mut().zip(other) {
+                *sum = simd.mul_add(other, simd.splat(1.0), *sum);
+            }
+            self.end_strip::<SLOPES>(simd);
         }
-        for (total, sum) in totals.iter_mut().zip(sums) {
-            *total += f64::from(simd.sum(sum));
+        if whole < x.len() {
+            sum_elements::<S, SLOPES>(simd, line, x, rows, dslopes, whole, x.len() - whole, &mut self.strip);
+            self.end_strip::<SLOPES>(simd);
         }
     }
-    totals
 }
 
 per_isa! {
@@ -333,26 +353,29 @@ fn sums_of<S: Simd, const SLOPES: u8>(
         let (scale, shift, mean) = (scale[channel], shift[channel], mean[channel]);
         let slope = slopes.single(channel);
         let line = Line { scale, shift, mean, slope, gain: 0.0, slope_x: 0.0, offset: 0.0 };
-        let mut totals = [0.0; 3];
+        let mut totals = Totals::new(simd);
         let of_plane = if SLOPES == EACH { channel * h * w..(channel + 1) * h * w } else { 0..0 };
         let plane_slopes = slopes.each(of_plane.clone());
         let plane_dslopes = &mut dslopes[of_plane];
         if pooled {
+            let mut vectors = 0;
             for (row, (x, dy)) in x.chunks_exact(2 * w).zip(dy.chunks_exact(w / 2)).enumerate() {
                 let both = if SLOPES == EACH { 2 * row * w..2 * (row + 1) * w } else { 0..0 };
                 let (above, below) = plane_slopes[both.clone()].split_at(both.len() / 2);
                 let (ds_above, ds_below) = plane_dslopes[both.clone()].split_at_mut(both.len() / 2);
-                let (x_above, x_below) = x.split_at(w);
-                let rows = Rows { dy, above, below };
-                let row = sums_of_windows::<S, SLOPES>(simd, &line, [x_above, x_below], rows, [ds_above, ds_below]);
-                for (total, sum) in totals.iter_mut().zip(row) {
-                    *total += sum;
+                totals.add_windows::<SLOPES>(simd, &line, x, Rows { dy, above, below }, [ds_above, ds_below]);
+                vectors += dy.len().div_ceil(S::LANES);
+                if vectors >= STRIP {
+                    totals.end_strip::<SLOPES>(simd);
+                    vectors = 0;
                 }
             }
+            totals.end_strip::<SLOPES>(simd);
         } else {
             let rows = Rows { dy, above: plane_slopes, below: &[] };
-            totals = sums_of_row::<S, SLOPES>(simd, &line, x, rows, plane_dslopes);
+            totals.add_plane::<SLOPES>(simd, &line, x, rows, plane_dslopes);
         }
+        let totals = totals.done;
         sums[channel] += totals[0];
         sums[c + channel] += totals[1] * f64::from(inv_std[channel]);
         if SLOPES == ONE {
@@ -435,8 +458,7 @@ fn backward_of<S: Simd, const SLOPES: u8>(
             };
             let both = if SLOPES == EACH { 2 * row * w..2 * (row + 1) * w } else { 0..0 };
             let (above, below) = plane_slopes[both.clone()].split_at(both.len() / 2);
-            let (x_above, x_below) = x.split_at_mut(w);
-            line.windows::<S, SLOPES>(simd, [x_above, x_below], Rows { dy, above, below });
+            line.windows::<S, SLOPES>(simd, x, Rows { dy, above, below });
         }
     }
 }
@@ -453,47 +475,42 @@ impl Line {
     #[inline(always)]
     fn row<S: Simd, const SLOPES: u8>(&self, simd: S, x: &mut [f32], rows: Rows) {
         #[inline(always)]
-        fn block<S: Simd, const SLOPES: u8>(simd: S, line: &Line, x: &mut [f32], rows: Rows, at: usize) {
-            let old = get(simd, x, at);
-            let (dz, _) = row_gradient::<S, SLOPES>(simd, line, old, rows, at);
+        fn vector<S: Simd, const SLOPES: u8>(simd: S, line: &Line, x: &mut [f32], rows: Rows, at: usize, count: usize) {
+            let old = get_first(simd, x, at, count);
+            let (dz, _) = row_gradient::<S, SLOPES>(simd, line, old, rows, at, count);
             let rest = simd.mul_add(old, simd.splat(line.slope_x), simd.splat(line.offset));
-            put(simd, x, at, simd.mul_add(dz, simd.splat(line.gain), rest));
+            put_first(simd, x, at, simd.mul_add(dz, simd.splat(line.gain), rest), count);
         }
         let whole = x.len() - x.len() % S::LANES;
         for at in (0..whole).step_by(S::LANES) {
-            block::<S, SLOPES>(simd, self, x, rows, at);
+            vector::<S, SLOPES>(simd, self, x, rows, at, S::LANES);
         }
         if whole < x.len() {
-            let (dy, above, mut end) = (filled(rows.dy, whole), filled(rows.above, whole), filled(x, whole));
-            block::<S, SLOPES>(simd, self, &mut end, Rows { dy: &dy, above: &above, below: &[] }, 0);
-            let count = x.len() - whole;
-            x[whole..].copy_from_slice(&end[..count]);
+            vector::<S, SLOPES>(simd, self, x, rows, whole, x.len() - whole);
         }
     }
 
     #[inline(always)]
-    fn windows<S: Simd, const SLOPES: u8>(&self, simd: S, x: [&mut [f32]; 2], rows: Rows) {
-        let [above, below] = x;
-        let (count, end) = (rows.dy.len(), 2 * rows.dy.len());
-        if count < S::LANES {
-            let slopes = [filled(rows.above, 0), filled(rows.below, 0)];
-            let (dy, rest) = (filled(rows.dy, 0), [filled(&above[..end], 0), filled(&below[..end], 0)]);
-            let rows = Rows { dy: &dy, above: &slopes[0], below: &slopes[1] };
-            let values = of_windows::<S, SLOPES>(simd, self, [&rest[0], &rest[1]], rows, 0);
-            let [mut a, mut b] = rest;
-            put_windows(simd, [&mut a, &mut b], 0, values);
-            above[..end].copy_from_slice(&a[..end]);
-            below[..end].copy_from_slice(&b[..end]);
-        } else {
-            // The last vector reaches back over windows of the one before: it is computed before they are replaced.
-            let last = of_windows::<S, SLOPES>(simd, self, [above, below], rows, count - S::LANES);
-            for at in (0..count - S::LANES).step_by(S::LANES) {
-                let values = of_windows::<S, SLOPES>(simd, self, [above, below], rows, at);
-                put_windows(simd, [&mut *above, &mut *below], at, values);
-            }
-            put_windows(simd, [&mut *above, &mut *below], count - S::LANES, last);
+    fn windows<S: Simd, const SLOPES: u8>(&self, simd: S, x: &mut [f32], rows: Rows) {
+        let ahead = x.as_ptr();
+        let (above, below) = x.split_at_mut(x.len() / 2);
+        let whole = rows.dy.len() - rows.dy.len() % S::LANES;
+        let rest = rows.dy.len() - whole;
+        // The last vector of a row is taken first and written last: what it reads over, with a mask, is the beginning of
+        // the next row, and a load of what is just being written has to wait.
+        let mut last = [simd.splat(0.0); 4];
+        if rest > 0 {
+            last = of_windows::<S, SLOPES>(simd, self, [above, below], rows, whole, rest);
         }
-        self.without_gradient(&mut above[end..]);
-        self.without_gradient(&mut below[end..]);
+        for at in (0..whole).step_by(S::LANES) {
+            prefetch_windows(simd, ahead, at);
+            let new = of_windows::<S, SLOPES>(simd, self, [above, below], rows, at, S::LANES);
+            put_windows(simd, [&mut *above, &mut *below], at, new, S::LANES);
+        }
+        if rest > 0 {
+            put_windows(simd, [&mut *above, &mut *below], whole, last, rest);
+        }
+        self.without_gradient(&mut above[2 * rows.dy.len()..]);
+        self.without_gradient(&mut below[2 * rows.dy.len()..]);
     }
 }

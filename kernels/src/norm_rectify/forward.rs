@@ -1,6 +1,7 @@
 //! The pass forward.
 
-use super::{RectifyShape, Slopes};
+use super::{EACH, ONE, RectifyShape, Slopes, ZERO, get_windows, largest, prefetch_windows, rectified};
+use crate::simd::{Simd, get_first, put_first};
 
 per_isa! {
     /// `y = pool(f(x scale[c] + shift[c]))`; `y` is overwritten.
@@ -11,7 +12,7 @@ per_isa! {
     /// # Panics
     /// If a slice has another length.
     pub fn forward<S>(
-        _simd: S,
+        simd: S,
         shape: &RectifyShape,
         n: usize,
         x: &[f32],
@@ -21,87 +22,114 @@ per_isa! {
         y: &mut [f32],
     ) {
         shape.check("norm_rectify forward", n, x.len(), y.len(), &[scale, shift], slopes);
-        let &RectifyShape { c, h, w, pooled } = shape;
         if y.is_empty() {
             return;
         }
-        for (plane, (x, y)) in x.chunks_exact(h * w).zip(y.chunks_exact_mut(shape.y_plane())).enumerate() {
-            let channel = plane % c;
-            let (scale, shift) = (scale[channel], shift[channel]);
-            if !pooled {
-                forward_row(x, scale, shift, slopes.of(shape, channel, 0..h), y);
-                continue;
-            }
-            for (row, (x, y)) in x.chunks_exact(2 * w).zip(y.chunks_exact_mut(w / 2)).enumerate() {
-                forward_windows(x, w, scale, shift, slopes.of(shape, channel, 2 * row..2 * row + 2), y);
-            }
+        match slopes {
+            Slopes::Zero => forward_of::<S, ZERO>(simd, shape, x, scale, shift, slopes, y),
+            Slopes::PerChannel(_) => forward_of::<S, ONE>(simd, shape, x, scale, shift, slopes, y),
+            Slopes::PerPosition(_) => forward_of::<S, EACH>(simd, shape, x, scale, shift, slopes, y),
         }
     }
 }
 
-#[inline(always)]
-fn relu(z: f32, _slope: f32) -> f32 {
-    if z > 0.0 { z } else { 0.0 }
+/// What is the same for a whole channel.
+#[derive(Clone, Copy)]
+struct Line {
+    /// `z = x scale + shift`.
+    scale: f32,
+    shift: f32,
+    /// The slope, where there is one for all.
+    slope: f32,
 }
 
 #[inline(always)]
-fn prelu(z: f32, slope: f32) -> f32 {
-    if z > 0.0 { z } else { slope * z }
-}
-
-#[inline(always)]
-fn forward_row(x: &[f32], scale: f32, shift: f32, slopes: Slopes, y: &mut [f32]) {
-    match slopes {
-        Slopes::Zero => y.iter_mut().zip(x).for_each(|(y, x)| *y = relu(x * scale + shift, 0.0)),
-        Slopes::PerChannel(slope) => {
-            let slope = slope[0];
-            y.iter_mut().zip(x).for_each(|(y, x)| *y = prelu(x * scale + shift, slope));
+fn forward_of<S: Simd, const SLOPES: u8>(
+    simd: S,
+    shape: &RectifyShape,
+    x: &[f32],
+    scale: &[f32],
+    shift: &[f32],
+    slopes: Slopes,
+    y: &mut [f32],
+) {
+    let &RectifyShape { c, h, w, pooled } = shape;
+    for (plane, (x, y)) in x.chunks_exact(h * w).zip(y.chunks_exact_mut(shape.y_plane())).enumerate() {
+        let channel = plane % c;
+        let line = Line { scale: scale[channel], shift: shift[channel], slope: slopes.single(channel) };
+        let slopes = slopes.each(if SLOPES == EACH { channel * h * w..(channel + 1) * h * w } else { 0..0 });
+        if !pooled {
+            line.row::<S, SLOPES>(simd, x, slopes, y);
+            continue;
         }
-        Slopes::PerPosition(slopes) => {
-            y.iter_mut().zip(x).zip(slopes).for_each(|((y, x), slope)| *y = prelu(x * scale + shift, *slope));
+        for (row, (x, y)) in x.chunks_exact(2 * w).zip(y.chunks_exact_mut(w / 2)).enumerate() {
+            let slopes = if SLOPES == EACH { &slopes[2 * row * w..2 * (row + 1) * w] } else { slopes };
+            line.windows::<S, SLOPES>(simd, x, slopes, y);
         }
     }
 }
 
-/// One row of windows from the two rows in `x`.
-#[inline(always)]
-fn forward_windows(x: &[f32], w: usize, scale: f32, shift: f32, slopes: Slopes, y: &mut [f32]) {
-    let (above, below) = x.split_at(w);
-    let windows = above.as_chunks::<2>().0.iter().zip(below.as_chunks::<2>().0);
-    // Written out: a closure might not be inlined into the function with the instruction set.
-    match slopes {
-        // This does not fall, so the largest can be taken first.
-        Slopes::Zero => {
-            for (y, (a, b)) in y.iter_mut().zip(windows) {
-                let (z0, z1) = (a[0] * scale + shift, a[1] * scale + shift);
-                let (z2, z3) = (b[0] * scale + shift, b[1] * scale + shift);
-                *y = relu(largest(z0, z1, z2, z3), 0.0);
-            }
+impl Line {
+    #[inline(always)]
+    fn row<S: Simd, const SLOPES: u8>(&self, simd: S, x: &[f32], slopes: &[f32], y: &mut [f32]) {
+        let whole = x.len() - x.len() % S::LANES;
+        for at in (0..whole).step_by(S::LANES) {
+            self.vector::<S, SLOPES>(simd, x, slopes, y, at, S::LANES);
         }
-        Slopes::PerChannel(slope) => {
-            let slope = slope[0];
-            for (y, (a, b)) in y.iter_mut().zip(windows) {
-                let (f0, f1) = (prelu(a[0] * scale + shift, slope), prelu(a[1] * scale + shift, slope));
-                let (f2, f3) = (prelu(b[0] * scale + shift, slope), prelu(b[1] * scale + shift, slope));
-                *y = largest(f0, f1, f2, f3);
-            }
-        }
-        Slopes::PerPosition(slopes) => {
-            let (s_above, s_below) = slopes.split_at(w);
-            let slopes = s_above.as_chunks::<2>().0.iter().zip(s_below.as_chunks::<2>().0);
-            for ((y, (a, b)), (s, t)) in y.iter_mut().zip(windows).zip(slopes) {
-                let (f0, f1) = (prelu(a[0] * scale + shift, s[0]), prelu(a[1] * scale + shift, s[1]));
-                let (f2, f3) = (prelu(b[0] * scale + shift, t[0]), prelu(b[1] * scale + shift, t[1]));
-                *y = largest(f0, f1, f2, f3);
-            }
+        if whole < x.len() {
+            self.vector::<S, SLOPES>(simd, x, slopes, y, whole, x.len() - whole);
         }
     }
-}
 
-/// The largest of a window.
-#[inline(always)]
-fn largest(a: f32, b: f32, c: f32, d: f32) -> f32 {
-    let above = if a > b { a } else { b };
-    let below = if c > d { c } else { d };
-    if above > below { above } else { below }
+    /// The `count` elements from `at` on, without pooling.
+    #[inline(always)]
+    fn vector<S: Simd, const SLOPES: u8>(
+        &self,
+        simd: S,
+        x: &[f32],
+        slopes: &[f32],
+        y: &mut [f32],
+        at: usize,
+        count: usize,
+    ) {
+        let z = simd.mul_add(get_first(simd, x, at, count), simd.splat(self.scale), simd.splat(self.shift));
+        let slope = if SLOPES == EACH { get_first(simd, slopes, at, count) } else { simd.splat(self.slope) };
+        put_first(simd, y, at, rectified::<S, SLOPES>(simd, z, slope), count);
+    }
+
+    /// One row of windows from the two rows in `x`.
+    #[inline(always)]
+    fn windows<S: Simd, const SLOPES: u8>(&self, simd: S, x: &[f32], slopes: &[f32], y: &mut [f32]) {
+        let (x_rows, slope_rows) = (x.split_at(x.len() / 2), slopes.split_at(slopes.len() / 2));
+        let whole = y.len() - y.len() % S::LANES;
+        for at in (0..whole).step_by(S::LANES) {
+            prefetch_windows(simd, x.as_ptr(), at);
+            self.block::<S, SLOPES>(simd, x_rows.into(), slope_rows.into(), y, at, S::LANES);
+        }
+        if whole < y.len() {
+            prefetch_windows(simd, x.as_ptr(), whole);
+            self.block::<S, SLOPES>(simd, x_rows.into(), slope_rows.into(), y, whole, y.len() - whole);
+        }
+    }
+
+    /// The `count` windows from window `at` on.
+    #[inline(always)]
+    fn block<S: Simd, const SLOPES: u8>(
+        &self,
+        simd: S,
+        x: [&[f32]; 2],
+        slopes: [&[f32]; 2],
+        y: &mut [f32],
+        at: usize,
+        count: usize,
+    ) {
+        let (scale, shift) = (simd.splat(self.scale), simd.splat(self.shift));
+        let mut z = get_windows(simd, x, at, count);
+        for z in &mut z {
+            *z = simd.mul_add(*z, scale, shift);
+        }
+        let slopes = if SLOPES == EACH { get_windows(simd, slopes, at, count) } else { [simd.splat(self.slope); 4] };
+        let (_, most) = largest::<S, SLOPES>(simd, z, slopes);
+        put_first(simd, y, at, most, count);
+    }
 }

@@ -13,6 +13,59 @@ mod forward;
 pub use backward::{backward, backward_sums};
 pub use forward::forward;
 
+use crate::simd::{ALIGNMENT, Simd, get_pairs};
+
+/// How the slopes of a row are found: none, one for all, or a list.
+const ZERO: u8 = 0;
+const ONE: u8 = 1;
+const EACH: u8 = 2;
+
+/// How far ahead of the work in `x`, in elements, cache lines are asked for. The rows of windows are two streams next to
+/// each other, which processors do not foresee well.
+const AHEAD: usize = 1024;
+
+/// Has what the windows of two rows from `x` on need some time later fetched: twice `LANES` elements of each row are
+/// read at a time.
+#[inline(always)]
+fn prefetch_windows<S: Simd>(simd: S, x: *const f32, at: usize) {
+    for line in (0..4 * S::LANES).step_by(ALIGNMENT) {
+        simd.prefetch_near(x.wrapping_add(AHEAD + 4 * at + line));
+    }
+}
+
+/// The values of `count` windows, at most `LANES`, in row-major order; of the two rows, those from window `at` on.
+#[inline(always)]
+fn get_windows<S: Simd>(simd: S, rows: [&[f32]; 2], at: usize, count: usize) -> [S::V; 4] {
+    let [a, b] = get_pairs(simd, rows[0], 2 * at, count);
+    let [c, d] = get_pairs(simd, rows[1], 2 * at, count);
+    [a, b, c, d]
+}
+
+/// What a rectifier makes of `z`. That of ReLU for NaN is 0.
+#[inline(always)]
+fn rectified<S: Simd, const SLOPES: u8>(simd: S, z: S::V, slope: S::V) -> S::V {
+    let zero = simd.splat(0.0);
+    if SLOPES == ZERO { simd.max(z, zero) } else { simd.select_greater(z, zero, z, simd.mul_add(z, slope, zero)) }
+}
+
+/// The rectified values of windows, and the largest of each. ReLU is left out of the former: it does not fall, so it can
+/// be taken of the largest, and where that is above 0 the place is the same.
+#[inline(always)]
+fn largest<S: Simd, const SLOPES: u8>(simd: S, z: [S::V; 4], slopes: [S::V; 4]) -> ([S::V; 4], S::V) {
+    let mut f = z;
+    if SLOPES != ZERO {
+        for i in 0..4 {
+            f[i] = rectified::<S, SLOPES>(simd, z[i], slopes[i]);
+        }
+    }
+    let mut most = if SLOPES == ZERO { simd.splat(0.0) } else { f[0] };
+    for f in f {
+        // In this order NaN does not count.
+        most = simd.max(f, most);
+    }
+    (f, most)
+}
+
 /// What follows the normalisation of `[n][c][h][w]` maps.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct RectifyShape {
@@ -78,19 +131,6 @@ impl<'a> Slopes<'a> {
     /// The slopes of a range of elements of the image, where each has its own.
     fn each(self, range: std::ops::Range<usize>) -> &'a [f32] {
         if let Slopes::PerPosition(slopes) = self { &slopes[range] } else { &[] }
-    }
-
-    /// The slopes of the rows `rows` of `w` elements of `channel`.
-    #[inline(always)]
-    fn of(self, shape: &RectifyShape, channel: usize, rows: std::ops::Range<usize>) -> Slopes<'a> {
-        match self {
-            Slopes::Zero => Slopes::Zero,
-            Slopes::PerChannel(slopes) => Slopes::PerChannel(&slopes[channel..=channel]),
-            Slopes::PerPosition(slopes) => {
-                let row = channel * shape.h;
-                Slopes::PerPosition(&slopes[(row + rows.start) * shape.w..(row + rows.end) * shape.w])
-            }
-        }
     }
 }
 

@@ -52,20 +52,20 @@ pub(crate) fn put_first<S: Simd>(simd: S, to: &mut [f32], at: usize, v: S::V, co
     unsafe { simd.store_first(to.as_mut_ptr(), v, to.len()) };
 }
 
-/// Twice `LANES` elements from `at` on, those at even places first.
+/// `count` pairs of elements from `at` on, at most `LANES`: first elements first. 0 in the lanes after the last.
 #[inline(always)]
-pub(crate) fn get_pairs<S: Simd>(simd: S, from: &[f32], at: usize) -> [S::V; 2] {
-    let from = &from[at..at + 2 * S::LANES];
-    // SAFETY: the slice has twice `LANES` elements.
-    unsafe { simd.load_pairs(from.as_ptr()) }
+pub(crate) fn get_pairs<S: Simd>(simd: S, from: &[f32], at: usize, count: usize) -> [S::V; 2] {
+    let from = &from[at..at + 2 * count.min(S::LANES)];
+    // SAFETY: the slice has as many pairs as are read.
+    unsafe { simd.load_pairs(from.as_ptr(), from.len() / 2) }
 }
 
 /// The reverse of [`get_pairs`].
 #[inline(always)]
-pub(crate) fn put_pairs<S: Simd>(simd: S, to: &mut [f32], at: usize, v: [S::V; 2]) {
-    let to = &mut to[at..at + 2 * S::LANES];
-    // SAFETY: the slice has twice `LANES` elements.
-    unsafe { simd.store_pairs(to.as_mut_ptr(), v) };
+pub(crate) fn put_pairs<S: Simd>(simd: S, to: &mut [f32], at: usize, v: [S::V; 2], count: usize) {
+    let to = &mut to[at..at + 2 * count.min(S::LANES)];
+    // SAFETY: the slice has as many pairs as are written.
+    unsafe { simd.store_pairs(to.as_mut_ptr(), v, to.len() / 2) };
 }
 
 /// Has part `part` of `parts` of what is to be read before long fetched into the second-level cache.
@@ -81,6 +81,8 @@ pub(crate) fn prefetch_part<S: Simd>(simd: S, upcoming: &[f32], part: usize, par
 pub(crate) trait Simd: Copy {
     /// A vector.
     type V: Copy;
+    /// True or false for each lane.
+    type M: Copy;
     /// Values in a vector, at most 16.
     const LANES: usize;
     /// Whether there are 32 registers, enough for 24 accumulators, and not 16, enough for 12.
@@ -90,10 +92,23 @@ pub(crate) trait Simd: Copy {
     fn splat(self, value: f32) -> Self::V;
     /// `a * b + c`, fused where the instruction set can.
     fn mul_add(self, a: Self::V, b: Self::V, c: Self::V) -> Self::V;
+    /// Lane by lane, `a` where `a > b`, else (also for NaN) `b`.
+    fn max(self, a: Self::V, b: Self::V) -> Self::V;
+    /// Where `a > b`; false for NaN.
+    fn greater(self, a: Self::V, b: Self::V) -> Self::M;
+    /// Where `a == b`; false for NaN.
+    fn equal(self, a: Self::V, b: Self::V) -> Self::M;
+    /// Where both hold.
+    fn and(self, a: Self::M, b: Self::M) -> Self::M;
+    /// Where `a` holds and `b` does not.
+    fn and_not(self, a: Self::M, b: Self::M) -> Self::M;
+    /// Lane by lane, `yes` where `mask` holds, else `no`.
+    fn select(self, mask: Self::M, yes: Self::V, no: Self::V) -> Self::V;
     /// Lane by lane, `yes` where `a > b`, else (also for NaN) `no`.
-    fn select_greater(self, a: Self::V, b: Self::V, yes: Self::V, no: Self::V) -> Self::V;
-    /// Lane by lane, `yes` where `a == b`, else (also for NaN) `no`.
-    fn select_equal(self, a: Self::V, b: Self::V, yes: Self::V, no: Self::V) -> Self::V;
+    #[inline(always)]
+    fn select_greater(self, a: Self::V, b: Self::V, yes: Self::V, no: Self::V) -> Self::V {
+        self.select(self.greater(a, b), yes, no)
+    }
     /// The sum of all lanes, in a fixed order.
     fn sum(self, v: Self::V) -> f32;
     /// The sum of all lanes of each vector, in a fixed order.
@@ -116,6 +131,11 @@ pub(crate) trait Simd: Copy {
     fn prefetch_to_read(self, p: *const f32) {
         let _ = p;
     }
+    /// Has the cache line of an address fetched into the first level, as it is to be read soon; any address will do.
+    #[inline(always)]
+    fn prefetch_near(self, p: *const f32) {
+        let _ = p;
+    }
 
     /// Reads `LANES` values.
     ///
@@ -127,32 +147,32 @@ pub(crate) trait Simd: Copy {
     /// # Safety
     /// `p` must be valid for reading `count` values.
     unsafe fn load_first(self, p: *const f32, count: usize) -> Self::V;
-    /// Reads `2 LANES` values: first those at even places, then those at odd ones.
+    /// Reads `count <= LANES` pairs of values: first those at even places, then those at odd ones. The other lanes are 0.
     ///
     /// # Safety
-    /// `p` must be valid for reading `2 LANES` values.
+    /// `p` must be valid for reading `2 count` values.
     #[inline(always)]
-    unsafe fn load_pairs(self, p: *const f32) -> [Self::V; 2] {
+    unsafe fn load_pairs(self, p: *const f32, count: usize) -> [Self::V; 2] {
         let mut lanes = [[0.0; 16]; 2];
-        for i in 0..2 * Self::LANES {
-            // SAFETY: the caller vouches for `2 LANES` values.
+        for i in 0..2 * count.min(Self::LANES) {
+            // SAFETY: the caller vouches for `2 count` values.
             lanes[i % 2][(i / 2) & 15] = unsafe { *p.add(i) };
         }
         // SAFETY: each row of `lanes` holds 16 values, and no vector is longer.
         unsafe { [self.load(lanes[0].as_ptr()), self.load(lanes[1].as_ptr())] }
     }
-    /// Writes `2 LANES` values, the reverse of [`Simd::load_pairs`].
+    /// Writes `count <= LANES` pairs, the reverse of [`Simd::load_pairs`].
     ///
     /// # Safety
-    /// `p` must be valid for writing `2 LANES` values.
+    /// `p` must be valid for writing `2 count` values.
     #[inline(always)]
-    unsafe fn store_pairs(self, p: *mut f32, v: [Self::V; 2]) {
+    unsafe fn store_pairs(self, p: *mut f32, v: [Self::V; 2], count: usize) {
         let mut lanes = [[0.0; 16]; 2];
         // SAFETY: each row of `lanes` holds 16 values; the caller vouches for the places.
         unsafe {
             self.store(lanes[0].as_mut_ptr(), v[0]);
             self.store(lanes[1].as_mut_ptr(), v[1]);
-            for i in 0..2 * Self::LANES {
+            for i in 0..2 * count.min(Self::LANES) {
                 *p.add(i) = lanes[i % 2][(i / 2) & 15];
             }
         }

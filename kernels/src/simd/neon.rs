@@ -23,6 +23,7 @@ impl Neon {
 
 impl Simd for Neon {
     type V = float32x4_t;
+    type M = uint32x4_t;
     const LANES: usize = 4;
     const MANY_REGISTERS: bool = true;
 
@@ -38,29 +39,71 @@ impl Simd for Neon {
         unsafe { vfmaq_f32(c, a, b) }
     }
 
+    // Not `vmaxq_f32`, which gives NaN where either is.
     #[inline(always)]
-    fn select_greater(self, a: float32x4_t, b: float32x4_t, yes: float32x4_t, no: float32x4_t) -> float32x4_t {
+    fn max(self, a: float32x4_t, b: float32x4_t) -> float32x4_t {
         // SAFETY: the token proves NEON.
-        unsafe { vbslq_f32(vcgtq_f32(a, b), yes, no) }
+        unsafe { vbslq_f32(vcgtq_f32(a, b), a, b) }
     }
 
     #[inline(always)]
-    fn select_equal(self, a: float32x4_t, b: float32x4_t, yes: float32x4_t, no: float32x4_t) -> float32x4_t {
+    fn greater(self, a: float32x4_t, b: float32x4_t) -> uint32x4_t {
         // SAFETY: the token proves NEON.
-        unsafe { vbslq_f32(vceqq_f32(a, b), yes, no) }
+        unsafe { vcgtq_f32(a, b) }
     }
 
     #[inline(always)]
-    unsafe fn load_pairs(self, p: *const f32) -> [float32x4_t; 2] {
-        // SAFETY: the token proves NEON, the caller vouches for 8 values.
-        let pairs = unsafe { vld2q_f32(p) };
+    fn equal(self, a: float32x4_t, b: float32x4_t) -> uint32x4_t {
+        // SAFETY: the token proves NEON.
+        unsafe { vceqq_f32(a, b) }
+    }
+
+    #[inline(always)]
+    fn and(self, a: uint32x4_t, b: uint32x4_t) -> uint32x4_t {
+        // SAFETY: the token proves NEON.
+        unsafe { vandq_u32(a, b) }
+    }
+
+    #[inline(always)]
+    fn and_not(self, a: uint32x4_t, b: uint32x4_t) -> uint32x4_t {
+        // SAFETY: the token proves NEON.
+        unsafe { vbicq_u32(a, b) }
+    }
+
+    #[inline(always)]
+    fn select(self, mask: uint32x4_t, yes: float32x4_t, no: float32x4_t) -> float32x4_t {
+        // SAFETY: the token proves NEON.
+        unsafe { vbslq_f32(mask, yes, no) }
+    }
+
+    #[inline(always)]
+    unsafe fn load_pairs(self, p: *const f32, count: usize) -> [float32x4_t; 2] {
+        let mut values = [0.0; 8];
+        // SAFETY: the token proves NEON, the caller vouches for `2 count` values; `values` holds 8.
+        let pairs = unsafe {
+            if count >= 4 {
+                vld2q_f32(p)
+            } else {
+                std::ptr::copy_nonoverlapping(p, values.as_mut_ptr(), 2 * count);
+                vld2q_f32(values.as_ptr())
+            }
+        };
         [pairs.0, pairs.1]
     }
 
     #[inline(always)]
-    unsafe fn store_pairs(self, p: *mut f32, v: [float32x4_t; 2]) {
-        // SAFETY: the token proves NEON, the caller vouches for 8 places.
-        unsafe { vst2q_f32(p, float32x4x2_t(v[0], v[1])) }
+    unsafe fn store_pairs(self, p: *mut f32, v: [float32x4_t; 2], count: usize) {
+        let pairs = float32x4x2_t(v[0], v[1]);
+        let mut values = [0.0; 8];
+        // SAFETY: the token proves NEON, the caller vouches for `2 count` places; `values` holds 8.
+        unsafe {
+            if count >= 4 {
+                vst2q_f32(p, pairs);
+            } else {
+                vst2q_f32(values.as_mut_ptr(), pairs);
+                std::ptr::copy_nonoverlapping(values.as_ptr(), p, 2 * count);
+            }
+        }
     }
 
     #[inline(always)]

@@ -8,6 +8,7 @@ pub(crate) struct Portable;
 
 impl Simd for Portable {
     type V = [f32; 4];
+    type M = [bool; 4];
     const LANES: usize = 4;
     const MANY_REGISTERS: bool = false;
 
@@ -23,13 +24,33 @@ impl Simd for Portable {
     }
 
     #[inline(always)]
-    fn select_greater(self, a: [f32; 4], b: [f32; 4], yes: [f32; 4], no: [f32; 4]) -> [f32; 4] {
-        std::array::from_fn(|i| if a[i] > b[i] { yes[i] } else { no[i] })
+    fn max(self, a: [f32; 4], b: [f32; 4]) -> [f32; 4] {
+        std::array::from_fn(|i| if a[i] > b[i] { a[i] } else { b[i] })
     }
 
     #[inline(always)]
-    fn select_equal(self, a: [f32; 4], b: [f32; 4], yes: [f32; 4], no: [f32; 4]) -> [f32; 4] {
-        std::array::from_fn(|i| if a[i] == b[i] { yes[i] } else { no[i] })
+    fn greater(self, a: [f32; 4], b: [f32; 4]) -> [bool; 4] {
+        std::array::from_fn(|i| a[i] > b[i])
+    }
+
+    #[inline(always)]
+    fn equal(self, a: [f32; 4], b: [f32; 4]) -> [bool; 4] {
+        std::array::from_fn(|i| a[i] == b[i])
+    }
+
+    #[inline(always)]
+    fn and(self, a: [bool; 4], b: [bool; 4]) -> [bool; 4] {
+        std::array::from_fn(|i| a[i] && b[i])
+    }
+
+    #[inline(always)]
+    fn and_not(self, a: [bool; 4], b: [bool; 4]) -> [bool; 4] {
+        std::array::from_fn(|i| a[i] && !b[i])
+    }
+
+    #[inline(always)]
+    fn select(self, mask: [bool; 4], yes: [f32; 4], no: [f32; 4]) -> [f32; 4] {
+        std::array::from_fn(|i| if mask[i] { yes[i] } else { no[i] })
     }
 
     #[inline(always)]

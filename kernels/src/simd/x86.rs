@@ -28,6 +28,7 @@ impl Avx2 {
 
 impl Simd for Avx2 {
     type V = __m256;
+    type M = __m256;
     const LANES: usize = 8;
     const MANY_REGISTERS: bool = false;
 
@@ -44,6 +45,12 @@ impl Simd for Avx2 {
     }
 
     #[inline(always)]
+    fn prefetch_near(self, p: *const f32) {
+        // SAFETY: the token proves x86-64; the instruction reads and writes nothing.
+        unsafe { _mm_prefetch::<_MM_HINT_T0>(p.cast()) }
+    }
+
+    #[inline(always)]
     fn splat(self, value: f32) -> __m256 {
         // SAFETY: the token proves AVX2.
         unsafe { _mm256_set1_ps(value) }
@@ -56,22 +63,47 @@ impl Simd for Avx2 {
     }
 
     #[inline(always)]
-    fn select_greater(self, a: __m256, b: __m256, yes: __m256, no: __m256) -> __m256 {
+    fn max(self, a: __m256, b: __m256) -> __m256 {
         // SAFETY: the token proves AVX2.
-        unsafe { _mm256_blendv_ps(no, yes, _mm256_cmp_ps::<_CMP_GT_OQ>(a, b)) }
+        unsafe { _mm256_max_ps(a, b) }
     }
 
     #[inline(always)]
-    fn select_equal(self, a: __m256, b: __m256, yes: __m256, no: __m256) -> __m256 {
+    fn greater(self, a: __m256, b: __m256) -> __m256 {
         // SAFETY: the token proves AVX2.
-        unsafe { _mm256_blendv_ps(no, yes, _mm256_cmp_ps::<_CMP_EQ_OQ>(a, b)) }
+        unsafe { _mm256_cmp_ps::<_CMP_GT_OQ>(a, b) }
     }
 
     #[inline(always)]
-    unsafe fn load_pairs(self, p: *const f32) -> [__m256; 2] {
-        // SAFETY: the token proves AVX2, the caller vouches for 16 values.
+    fn equal(self, a: __m256, b: __m256) -> __m256 {
+        // SAFETY: the token proves AVX2.
+        unsafe { _mm256_cmp_ps::<_CMP_EQ_OQ>(a, b) }
+    }
+
+    #[inline(always)]
+    fn and(self, a: __m256, b: __m256) -> __m256 {
+        // SAFETY: the token proves AVX2.
+        unsafe { _mm256_and_ps(a, b) }
+    }
+
+    #[inline(always)]
+    fn and_not(self, a: __m256, b: __m256) -> __m256 {
+        // SAFETY: the token proves AVX2.
+        unsafe { _mm256_andnot_ps(b, a) }
+    }
+
+    #[inline(always)]
+    fn select(self, mask: __m256, yes: __m256, no: __m256) -> __m256 {
+        // SAFETY: the token proves AVX2.
+        unsafe { _mm256_blendv_ps(no, yes, mask) }
+    }
+
+    #[inline(always)]
+    unsafe fn load_pairs(self, p: *const f32, count: usize) -> [__m256; 2] {
+        // SAFETY: the token proves AVX2; no more than `2 count` values are read, for which the caller vouches.
         unsafe {
-            let (low, high) = (_mm256_loadu_ps(p), _mm256_loadu_ps(p.add(8)));
+            let low = self.load_first(p, 2 * count);
+            let high = self.load_first(p.wrapping_add(8), (2 * count).saturating_sub(8));
             let even = _mm256_castps_pd(_mm256_shuffle_ps::<0b10_00_10_00>(low, high));
             let odd = _mm256_castps_pd(_mm256_shuffle_ps::<0b11_01_11_01>(low, high));
             [
@@ -82,12 +114,13 @@ impl Simd for Avx2 {
     }
 
     #[inline(always)]
-    unsafe fn store_pairs(self, p: *mut f32, v: [__m256; 2]) {
-        // SAFETY: the token proves AVX2, the caller vouches for 16 places.
+    unsafe fn store_pairs(self, p: *mut f32, v: [__m256; 2], count: usize) {
+        // SAFETY: the token proves AVX2; no more than `2 count` places are written, for which the caller vouches.
         unsafe {
             let (low, high) = (_mm256_unpacklo_ps(v[0], v[1]), _mm256_unpackhi_ps(v[0], v[1]));
-            _mm256_storeu_ps(p, _mm256_permute2f128_ps::<0x20>(low, high));
-            _mm256_storeu_ps(p.add(8), _mm256_permute2f128_ps::<0x31>(low, high));
+            self.store_first(p, _mm256_permute2f128_ps::<0x20>(low, high), 2 * count);
+            let rest = (2 * count).saturating_sub(8);
+            self.store_first(p.wrapping_add(8), _mm256_permute2f128_ps::<0x31>(low, high), rest);
         }
     }
 
@@ -264,10 +297,32 @@ impl Avx512 {
     fn first(self, count: usize) -> __mmask16 {
         ((1u32 << count.min(16)) - 1) as __mmask16
     }
+
+    /// Writes the first `count <= 16` lanes without a mask: a load of what lies behind them, if it follows soon, would
+    /// wait for a store with a mask that reaches over it.
+    ///
+    /// # Safety
+    /// `p` must be valid for writing `count` values.
+    #[inline(always)]
+    unsafe fn store_pieces(self, p: *mut f32, v: __m512, count: usize) {
+        // SAFETY: the token proves AVX-512 and with it AVX2; only the values for which the caller vouches are written.
+        unsafe {
+            if count >= 16 {
+                return _mm512_storeu_ps(p, v);
+            }
+            let low = _mm512_castps512_ps256(v);
+            if count < 8 {
+                return Avx2(()).store_first(p, low, count);
+            }
+            _mm256_storeu_ps(p, low);
+            Avx2(()).store_first(p.add(8), _mm512_extractf32x8_ps::<1>(v), count - 8);
+        }
+    }
 }
 
 impl Simd for Avx512 {
     type V = __m512;
+    type M = __mmask16;
     const LANES: usize = 16;
     const MANY_REGISTERS: bool = true;
 
@@ -284,6 +339,12 @@ impl Simd for Avx512 {
     }
 
     #[inline(always)]
+    fn prefetch_near(self, p: *const f32) {
+        // SAFETY: the token proves x86-64; the instruction reads and writes nothing.
+        unsafe { _mm_prefetch::<_MM_HINT_T0>(p.cast()) }
+    }
+
+    #[inline(always)]
     fn splat(self, value: f32) -> __m512 {
         // SAFETY: the token proves AVX-512.
         unsafe { _mm512_set1_ps(value) }
@@ -296,22 +357,45 @@ impl Simd for Avx512 {
     }
 
     #[inline(always)]
-    fn select_greater(self, a: __m512, b: __m512, yes: __m512, no: __m512) -> __m512 {
+    fn max(self, a: __m512, b: __m512) -> __m512 {
         // SAFETY: the token proves AVX-512.
-        unsafe { _mm512_mask_blend_ps(_mm512_cmp_ps_mask::<_CMP_GT_OQ>(a, b), no, yes) }
+        unsafe { _mm512_max_ps(a, b) }
     }
 
     #[inline(always)]
-    fn select_equal(self, a: __m512, b: __m512, yes: __m512, no: __m512) -> __m512 {
+    fn greater(self, a: __m512, b: __m512) -> __mmask16 {
         // SAFETY: the token proves AVX-512.
-        unsafe { _mm512_mask_blend_ps(_mm512_cmp_ps_mask::<_CMP_EQ_OQ>(a, b), no, yes) }
+        unsafe { _mm512_cmp_ps_mask::<_CMP_GT_OQ>(a, b) }
     }
 
     #[inline(always)]
-    unsafe fn load_pairs(self, p: *const f32) -> [__m512; 2] {
-        // SAFETY: the token proves AVX-512, the caller vouches for 32 values.
+    fn equal(self, a: __m512, b: __m512) -> __mmask16 {
+        // SAFETY: the token proves AVX-512.
+        unsafe { _mm512_cmp_ps_mask::<_CMP_EQ_OQ>(a, b) }
+    }
+
+    #[inline(always)]
+    fn and(self, a: __mmask16, b: __mmask16) -> __mmask16 {
+        a & b
+    }
+
+    #[inline(always)]
+    fn and_not(self, a: __mmask16, b: __mmask16) -> __mmask16 {
+        a & !b
+    }
+
+    #[inline(always)]
+    fn select(self, mask: __mmask16, yes: __m512, no: __m512) -> __m512 {
+        // SAFETY: the token proves AVX-512.
+        unsafe { _mm512_mask_blend_ps(mask, no, yes) }
+    }
+
+    #[inline(always)]
+    unsafe fn load_pairs(self, p: *const f32, count: usize) -> [__m512; 2] {
+        // SAFETY: the token proves AVX-512; the masks admit `2 count` values, for which the caller vouches.
         unsafe {
-            let (low, high) = (_mm512_loadu_ps(p), _mm512_loadu_ps(p.add(16)));
+            let low = self.load_first(p, 2 * count);
+            let high = self.load_first(p.wrapping_add(16), (2 * count).saturating_sub(16));
             let even = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
             let odd = _mm512_setr_epi32(1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31);
             [_mm512_permutex2var_ps(low, even, high), _mm512_permutex2var_ps(low, odd, high)]
@@ -319,13 +403,14 @@ impl Simd for Avx512 {
     }
 
     #[inline(always)]
-    unsafe fn store_pairs(self, p: *mut f32, v: [__m512; 2]) {
-        // SAFETY: the token proves AVX-512, the caller vouches for 32 places.
+    unsafe fn store_pairs(self, p: *mut f32, v: [__m512; 2], count: usize) {
+        // SAFETY: the token proves AVX-512; the masks admit `2 count` places, for which the caller vouches.
         unsafe {
             let low = _mm512_setr_epi32(0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23);
             let high = _mm512_setr_epi32(8, 24, 9, 25, 10, 26, 11, 27, 12, 28, 13, 29, 14, 30, 15, 31);
-            _mm512_storeu_ps(p, _mm512_permutex2var_ps(v[0], low, v[1]));
-            _mm512_storeu_ps(p.add(16), _mm512_permutex2var_ps(v[0], high, v[1]));
+            self.store_pieces(p, _mm512_permutex2var_ps(v[0], low, v[1]), 2 * count);
+            let rest = (2 * count).saturating_sub(16);
+            self.store_pieces(p.wrapping_add(16), _mm512_permutex2var_ps(v[0], high, v[1]), rest);
         }
     }
 
