@@ -26,29 +26,33 @@ fn plane_sums<S: Simd>(simd: S, x: &[f32]) -> (f64, f64) {
     let Some(&origin) = x.first() else { return (0.0, 0.0) };
     let (zero, one, minus) = (simd.splat(0.0), simd.splat(1.0), simd.splat(-origin));
     let (mut sum, mut squares) = (0.0, 0.0);
-    let whole = x.len() - x.len() % S::LANES;
-    for start in (0..whole).step_by(4 * STRIP * S::LANES) {
-        let strip = &x[start..whole.min(start + 4 * STRIP * S::LANES)];
+    for strip in x.chunks(4 * STRIP * S::LANES) {
         // Side by side: an addition would wait for the one before.
         let (mut sums, mut sums_of_squares) = ([zero; 4], [zero; 4]);
-        for at in (0..strip.len()).step_by(4 * S::LANES) {
+        let blocks = strip.chunks_exact(4 * S::LANES);
+        let vectors = blocks.remainder().chunks_exact(S::LANES);
+        let rest = vectors.remainder();
+        for block in blocks {
             for i in 0..4 {
-                if at + i * S::LANES < strip.len() {
-                    let x = simd.mul_add(get(simd, strip, at + i * S::LANES), one, minus);
-                    sums[i] = simd.mul_add(x, one, sums[i]);
-                    sums_of_squares[i] = simd.mul_add(x, x, sums_of_squares[i]);
-                }
+                let x = simd.mul_add(get(simd, block, i * S::LANES), one, minus);
+                sums[i] = simd.mul_add(x, one, sums[i]);
+                sums_of_squares[i] = simd.mul_add(x, x, sums_of_squares[i]);
             }
+        }
+        for vector in vectors {
+            let x = simd.mul_add(get(simd, vector, 0), one, minus);
+            sums[0] = simd.mul_add(x, one, sums[0]);
+            sums_of_squares[0] = simd.mul_add(x, x, sums_of_squares[0]);
         }
         for i in 0..4 {
             sum += f64::from(simd.sum(sums[i]));
             squares += f64::from(simd.sum(sums_of_squares[i]));
         }
-    }
-    for x in &x[whole..] {
-        let x = f64::from(x - origin);
-        sum += x;
-        squares += x * x;
+        for x in rest {
+            let x = f64::from(x - origin);
+            sum += x;
+            squares += x * x;
+        }
     }
     let (origin, count) = (f64::from(origin), x.len() as f64);
     (sum + count * origin, squares + origin * (2.0 * sum + count * origin))

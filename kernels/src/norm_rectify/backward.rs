@@ -128,7 +128,8 @@ fn sum_windows<S: Simd, const SLOPES: u8>(
     let x = get_windows(simd, x, at, count);
     let windows = Windows::new::<SLOPES>(simd, line, x, rows, at, count);
     // Windows that do not exist have no `dy`, so they add nothing.
-    let (dz, of_slope) = windows.gradient::<SLOPES>(simd, get_first(simd, rows.dy, at, count));
+    let dy = simd.to_pair_order(get_first(simd, rows.dy, at, count));
+    let (dz, of_slope) = windows.gradient::<SLOPES>(simd, dy);
     add::<S, SLOPES>(simd, line, windows.choose(simd, x), dz, of_slope, sums);
     if SLOPES != EACH {
         return x;
@@ -164,7 +165,7 @@ fn of_windows<S: Simd, const SLOPES: u8>(
 ) -> [S::V; 4] {
     let mut x = get_windows(simd, x, at, count);
     let windows = Windows::new::<SLOPES>(simd, line, x, rows, at, count);
-    let dy = get_first(simd, rows.dy, at, count);
+    let dy = simd.to_pair_order(get_first(simd, rows.dy, at, count));
     // Where a window of ReLU has no gradient, none of its places is taken.
     let dz = if SLOPES == ZERO { dy } else { windows.gradient::<SLOPES>(simd, dy).0 };
     let places = windows.places::<SLOPES>(simd);

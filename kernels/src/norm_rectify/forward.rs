@@ -72,12 +72,17 @@ fn forward_of<S: Simd, const SLOPES: u8>(
 impl Line {
     #[inline(always)]
     fn row<S: Simd, const SLOPES: u8>(&self, simd: S, x: &[f32], slopes: &[f32], y: &mut [f32]) {
-        let whole = x.len() - x.len() % S::LANES;
-        for at in (0..whole).step_by(S::LANES) {
-            self.vector::<S, SLOPES>(simd, x, slopes, y, at, S::LANES);
+        let mut at = 0;
+        while at + 4 * S::LANES <= x.len() {
+            for i in 0..4 {
+                self.vector::<S, SLOPES>(simd, x, slopes, y, at + i * S::LANES, S::LANES);
+            }
+            at += 4 * S::LANES;
         }
-        if whole < x.len() {
-            self.vector::<S, SLOPES>(simd, x, slopes, y, whole, x.len() - whole);
+        while at < x.len() {
+            let count = (x.len() - at).min(S::LANES);
+            self.vector::<S, SLOPES>(simd, x, slopes, y, at, count);
+            at += count;
         }
     }
 
@@ -130,6 +135,6 @@ impl Line {
         }
         let slopes = if SLOPES == EACH { get_windows(simd, slopes, at, count) } else { [simd.splat(self.slope); 4] };
         let (_, most) = largest::<S, SLOPES>(simd, z, slopes);
-        put_first(simd, y, at, most, count);
+        put_first(simd, y, at, simd.to_memory_order(most), count);
     }
 }

@@ -33,7 +33,8 @@ fn prefetch_windows<S: Simd>(simd: S, x: *const f32, at: usize) {
     }
 }
 
-/// The values of `count` windows, at most `LANES`, in row-major order; of the two rows, those from window `at` on.
+/// The values of `count` windows, at most `LANES`, in row-major order; of the two rows, those from window `at` on. The
+/// windows are in the order of [`Simd::load_pairs`].
 #[inline(always)]
 fn get_windows<S: Simd>(simd: S, rows: [&[f32]; 2], at: usize, count: usize) -> [S::V; 4] {
     let [a, b] = get_pairs(simd, rows[0], 2 * at, count);

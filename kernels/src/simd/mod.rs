@@ -52,7 +52,7 @@ pub(crate) fn put_first<S: Simd>(simd: S, to: &mut [f32], at: usize, v: S::V, co
     unsafe { simd.store_first(to.as_mut_ptr(), v, to.len()) };
 }
 
-/// `count` pairs of elements from `at` on, at most `LANES`: first elements first. 0 in the lanes after the last.
+/// `count` pairs of elements from `at` on, at most `LANES`: first elements first, in the order of [`Simd::load_pairs`].
 #[inline(always)]
 pub(crate) fn get_pairs<S: Simd>(simd: S, from: &[f32], at: usize, count: usize) -> [S::V; 2] {
     let from = &from[at..at + 2 * count.min(S::LANES)];
@@ -147,7 +147,8 @@ pub(crate) trait Simd: Copy {
     /// # Safety
     /// `p` must be valid for reading `count` values.
     unsafe fn load_first(self, p: *const f32, count: usize) -> Self::V;
-    /// Reads `count <= LANES` pairs of values: first those at even places, then those at odd ones. The other lanes are 0.
+    /// Reads `count <= LANES` pairs of values: first those at even places, then those at odd ones. Which pair is in which
+    /// lane is for the instruction set to say, see [`Simd::to_pair_order`]; the lanes of those not read are 0.
     ///
     /// # Safety
     /// `p` must be valid for reading `2 count` values.
@@ -160,6 +161,16 @@ pub(crate) trait Simd: Copy {
         }
         // SAFETY: each row of `lanes` holds 16 values, and no vector is longer.
         unsafe { [self.load(lanes[0].as_ptr()), self.load(lanes[1].as_ptr())] }
+    }
+    /// Brings one value for each pair, lane by lane, in the order of [`Simd::load_pairs`].
+    #[inline(always)]
+    fn to_pair_order(self, v: Self::V) -> Self::V {
+        v
+    }
+    /// The reverse of [`Simd::to_pair_order`].
+    #[inline(always)]
+    fn to_memory_order(self, v: Self::V) -> Self::V {
+        v
     }
     /// Writes `count <= LANES` pairs, the reverse of [`Simd::load_pairs`].
     ///

@@ -8,7 +8,8 @@ pub(crate) struct Portable;
 
 impl Simd for Portable {
     type V = [f32; 4];
-    type M = [bool; 4];
+    /// All bits of a lane are set, or none.
+    type M = [u32; 4];
     const LANES: usize = 4;
     const MANY_REGISTERS: bool = false;
 
@@ -29,28 +30,44 @@ impl Simd for Portable {
     }
 
     #[inline(always)]
-    fn greater(self, a: [f32; 4], b: [f32; 4]) -> [bool; 4] {
-        std::array::from_fn(|i| a[i] > b[i])
+    fn greater(self, a: [f32; 4], b: [f32; 4]) -> [u32; 4] {
+        std::array::from_fn(|i| u32::from(a[i] > b[i]).wrapping_neg())
     }
 
     #[inline(always)]
-    fn equal(self, a: [f32; 4], b: [f32; 4]) -> [bool; 4] {
-        std::array::from_fn(|i| a[i] == b[i])
+    fn equal(self, a: [f32; 4], b: [f32; 4]) -> [u32; 4] {
+        std::array::from_fn(|i| u32::from(a[i] == b[i]).wrapping_neg())
     }
 
     #[inline(always)]
-    fn and(self, a: [bool; 4], b: [bool; 4]) -> [bool; 4] {
-        std::array::from_fn(|i| a[i] && b[i])
+    fn and(self, a: [u32; 4], b: [u32; 4]) -> [u32; 4] {
+        std::array::from_fn(|i| a[i] & b[i])
     }
 
     #[inline(always)]
-    fn and_not(self, a: [bool; 4], b: [bool; 4]) -> [bool; 4] {
-        std::array::from_fn(|i| a[i] && !b[i])
+    fn and_not(self, a: [u32; 4], b: [u32; 4]) -> [u32; 4] {
+        std::array::from_fn(|i| a[i] & !b[i])
     }
 
     #[inline(always)]
-    fn select(self, mask: [bool; 4], yes: [f32; 4], no: [f32; 4]) -> [f32; 4] {
-        std::array::from_fn(|i| if mask[i] { yes[i] } else { no[i] })
+    fn select(self, mask: [u32; 4], yes: [f32; 4], no: [f32; 4]) -> [f32; 4] {
+        std::array::from_fn(|i| f32::from_bits((mask[i] & yes[i].to_bits()) | (!mask[i] & no[i].to_bits())))
+    }
+
+    #[inline(always)]
+    unsafe fn load_pairs(self, p: *const f32, count: usize) -> [[f32; 4]; 2] {
+        let mut values = [0.0; 8];
+        // SAFETY: the caller vouches for `2 count` values; no more than 8 are copied.
+        unsafe { std::ptr::copy_nonoverlapping(p, values.as_mut_ptr(), 2 * count.min(4)) };
+        let [a, b, c, d, e, f, g, h] = values;
+        [[a, c, e, g], [b, d, f, h]]
+    }
+
+    #[inline(always)]
+    unsafe fn store_pairs(self, p: *mut f32, v: [[f32; 4]; 2], count: usize) {
+        let [[a, c, e, g], [b, d, f, h]] = v;
+        // SAFETY: the caller vouches for `2 count` places; no more than 8 are copied.
+        unsafe { std::ptr::copy_nonoverlapping([a, b, c, d, e, f, g, h].as_ptr(), p, 2 * count.min(4)) };
     }
 
     #[inline(always)]

@@ -104,23 +104,28 @@ impl Simd for Avx2 {
         unsafe {
             let low = self.load_first(p, 2 * count);
             let high = self.load_first(p.wrapping_add(8), (2 * count).saturating_sub(8));
-            let even = _mm256_castps_pd(_mm256_shuffle_ps::<0b10_00_10_00>(low, high));
-            let odd = _mm256_castps_pd(_mm256_shuffle_ps::<0b11_01_11_01>(low, high));
-            [
-                _mm256_castpd_ps(_mm256_permute4x64_pd::<0b11_01_10_00>(even)),
-                _mm256_castpd_ps(_mm256_permute4x64_pd::<0b11_01_10_00>(odd)),
-            ]
+            // Within each half of a vector, which costs less than to go beyond: two pairs of `low`, two of `high`.
+            [_mm256_shuffle_ps::<0b10_00_10_00>(low, high), _mm256_shuffle_ps::<0b11_01_11_01>(low, high)]
         }
+    }
+
+    #[inline(always)]
+    fn to_pair_order(self, v: __m256) -> __m256 {
+        // SAFETY: the token proves AVX2.
+        unsafe { _mm256_castpd_ps(_mm256_permute4x64_pd::<0b11_01_10_00>(_mm256_castps_pd(v))) }
+    }
+
+    #[inline(always)]
+    fn to_memory_order(self, v: __m256) -> __m256 {
+        self.to_pair_order(v)
     }
 
     #[inline(always)]
     unsafe fn store_pairs(self, p: *mut f32, v: [__m256; 2], count: usize) {
         // SAFETY: the token proves AVX2; no more than `2 count` places are written, for which the caller vouches.
         unsafe {
-            let (low, high) = (_mm256_unpacklo_ps(v[0], v[1]), _mm256_unpackhi_ps(v[0], v[1]));
-            self.store_first(p, _mm256_permute2f128_ps::<0x20>(low, high), 2 * count);
-            let rest = (2 * count).saturating_sub(8);
-            self.store_first(p.wrapping_add(8), _mm256_permute2f128_ps::<0x31>(low, high), rest);
+            self.store_first(p, _mm256_unpacklo_ps(v[0], v[1]), 2 * count);
+            self.store_first(p.wrapping_add(8), _mm256_unpackhi_ps(v[0], v[1]), (2 * count).saturating_sub(8));
         }
     }
 
@@ -396,21 +401,36 @@ impl Simd for Avx512 {
         unsafe {
             let low = self.load_first(p, 2 * count);
             let high = self.load_first(p.wrapping_add(16), (2 * count).saturating_sub(16));
-            let even = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
-            let odd = _mm512_setr_epi32(1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31);
-            [_mm512_permutex2var_ps(low, even, high), _mm512_permutex2var_ps(low, odd, high)]
+            // Within each quarter of a vector, which costs less than to go beyond: two pairs of `low`, two of `high`.
+            [_mm512_shuffle_ps::<0b10_00_10_00>(low, high), _mm512_shuffle_ps::<0b11_01_11_01>(low, high)]
+        }
+    }
+
+    #[inline(always)]
+    fn to_pair_order(self, v: __m512) -> __m512 {
+        // SAFETY: the token proves AVX-512.
+        unsafe {
+            let order = _mm512_setr_epi64(0, 4, 1, 5, 2, 6, 3, 7);
+            _mm512_castpd_ps(_mm512_permutexvar_pd(order, _mm512_castps_pd(v)))
+        }
+    }
+
+    #[inline(always)]
+    fn to_memory_order(self, v: __m512) -> __m512 {
+        // SAFETY: the token proves AVX-512.
+        unsafe {
+            let order = _mm512_setr_epi64(0, 2, 4, 6, 1, 3, 5, 7);
+            _mm512_castpd_ps(_mm512_permutexvar_pd(order, _mm512_castps_pd(v)))
         }
     }
 
     #[inline(always)]
     unsafe fn store_pairs(self, p: *mut f32, v: [__m512; 2], count: usize) {
-        // SAFETY: the token proves AVX-512; the masks admit `2 count` places, for which the caller vouches.
+        // SAFETY: the token proves AVX-512; no more than `2 count` places are written, for which the caller vouches.
         unsafe {
-            let low = _mm512_setr_epi32(0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23);
-            let high = _mm512_setr_epi32(8, 24, 9, 25, 10, 26, 11, 27, 12, 28, 13, 29, 14, 30, 15, 31);
-            self.store_pieces(p, _mm512_permutex2var_ps(v[0], low, v[1]), 2 * count);
+            self.store_pieces(p, _mm512_unpacklo_ps(v[0], v[1]), 2 * count);
             let rest = (2 * count).saturating_sub(16);
-            self.store_pieces(p.wrapping_add(16), _mm512_permutex2var_ps(v[0], high, v[1]), rest);
+            self.store_pieces(p.wrapping_add(16), _mm512_unpackhi_ps(v[0], v[1]), rest);
         }
     }
 

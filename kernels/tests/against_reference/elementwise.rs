@@ -137,11 +137,37 @@ fn pooling_agrees_with_the_loops() {
 }
 
 #[test]
+fn the_variance_of_what_deviates_little_from_a_large_mean_is_kept() {
+    for isa in isas() {
+        for (c, hw) in [(2, 5616), (3, 6004), (2, 47)] {
+            for deviation in [0.0, 0.25] {
+                let n = 3;
+                let x: Vec<f32> = numbers(1, n * c * hw).iter().map(|v| 300.1 + deviation * v).collect();
+                let (mut expected, mut actual) = (vec![0.0; 2 * c], vec![0.0; 2 * c]);
+                reference::channel_sums(c, hw, &x, &mut expected);
+                norm::channel_sums(isa, n, c, hw, &x, &mut actual);
+                let count = (n * hw) as f64;
+                for channel in 0..c {
+                    let [expected, actual] = [&expected, &actual].map(|sums| {
+                        let mean = sums[channel] / count;
+                        sums[c + channel] / count - mean * mean
+                    });
+                    // The sums of the loops in double precision have an error of their own.
+                    let error = (actual - expected).abs();
+                    let what = format!("{} c={c} hw={hw} deviation {deviation}", isa.name());
+                    assert!(error <= 1e-6 * expected.abs() + 1e-7, "{what}: variance {actual}, not {expected}");
+                }
+            }
+        }
+    }
+}
+
+#[test]
 fn normalisation_agrees_with_the_loops() {
     let mut failures = Failures::default();
     let narrow = |sums: Vec<f64>| sums.iter().map(|&sum| sum as f32).collect::<Vec<f32>>();
     for isa in isas() {
-        for (n, c, hw) in [(0, 3, 5), (1, 1, 1), (2, 3, 15), (3, 2, 16), (2, 4, 129)] {
+        for (n, c, hw) in [(0, 3, 5), (1, 1, 1), (2, 3, 15), (3, 2, 16), (2, 4, 129), (1, 2, 5000)] {
             let what = format!("{} n={n} c={c} hw={hw}", isa.name());
             let (x, dy) = (numbers(1, n * c * hw), numbers(2, n * c * hw));
             let stats: [Vec<f32>; 5] = [3, 4, 5, 6, 7].map(|seed| numbers(seed, c));

@@ -93,6 +93,49 @@ fn norm_rectify_agrees_with_its_parts() {
 }
 
 #[test]
+fn of_equal_values_in_a_window_the_first_gets_the_gradient() {
+    let mut failures = Failures::default();
+    let [c, h, w, n] = [2, 6, 70, 2];
+    let (hw, len) = (h * w, n * c * h * w);
+    let shape = RectifyShape { c, h, w, pooled: true };
+    let pool_shape = pool::PoolShape { c, h, w, kh: 2, kw: 2, stride_h: 2, stride_w: 2 };
+    // So coarse that nothing is rounded and most windows have two largest values or more, on both sides of 0.
+    let x: Vec<f32> = numbers(1, len).iter().map(|v| (2.0 * v).round() / 2.0).collect();
+    let dy = numbers(2, len / 4);
+    let (scale, shift, list) = ([2.0, -0.5], [-0.5, 0.25], [0.5, -1.0]);
+    let (mean, inv_std, gain, none) = ([0.0; 2], [1.0; 2], [1.0; 2], [0.0; 2]);
+    for isa in isas() {
+        for slopes in [Slopes::Zero, Slopes::PerChannel(&list)] {
+            let (mut z, mut f, mut y) = (nans(len), nans(len), nans(len / 4));
+            let (mut df, mut dz) = (nans(len), nans(len));
+            reference::normalize(c, hw, &x, &scale, &shift, &mut z);
+            match slopes {
+                Slopes::Zero => reference::relu_forward(&z, &mut f),
+                _ => reference::prelu_forward(&list, hw, &z, &mut f),
+            }
+            reference::max_forward(&pool_shape, n, &f, &mut y);
+            reference::max_backward(&pool_shape, n, &f, &y, &dy, &mut df);
+            match slopes {
+                Slopes::Zero => reference::relu_backward(&f, &df, &mut dz),
+                _ => reference::prelu_backward(&list, hw, &z, &df, &mut dz, &mut [0.0; 2]),
+            }
+            let statistics = ChannelStatistics { mean: &mean, inv_std: &inv_std, scale: &scale, shift: &shift };
+            let means = ChannelMeans { dz: &none, dz_xhat: &none, gain: &gain };
+            let mut actual = x.clone();
+            norm_rectify::backward(isa, &shape, n, &mut actual, &dy, statistics, means, slopes);
+            failures.compare(&format!("{} {slopes:?}", isa.name()), &actual, &dz, 0.0);
+            let (mut sums, mut actual_sums) = ([0.0; 4], [0.0; 4]);
+            reference::norm_backward_sums((c, hw), &x, &dz, &mean, &inv_std, &mut sums);
+            let mut dslopes = vec![0.0; if slopes == Slopes::Zero { 0 } else { c }];
+            norm_rectify::backward_sums(isa, &shape, n, &x, &dy, statistics, slopes, &mut actual_sums, &mut dslopes);
+            let [sums, actual_sums] = [sums, actual_sums].map(|sums| sums.map(|sum| sum as f32));
+            failures.compare(&format!("sums {} {slopes:?}", isa.name()), &actual_sums, &sums, 1e-5);
+        }
+    }
+    failures.report();
+}
+
+#[test]
 fn gradients_behind_a_pooling_agree_with_those_of_the_whole_map() {
     let mut failures = Failures::default();
     for isa in isas() {
