@@ -288,16 +288,16 @@ fn pairs_tile<S: Simd, const M: usize>(
             let [even, odd] = unsafe {
                 let from = from.as_ptr().add(2 * i * width + 2 * column);
                 if there >= 2 * S::LANES {
-                    simd.load_pairs(from)
+                    simd.load_pairs(from, S::LANES)
                 } else {
                     let mut ends = [0.0; 2 * MOST_LANES];
                     simd.store(ends.as_mut_ptr(), simd.load_first(from, there.min(S::LANES)));
                     let rest = there.saturating_sub(S::LANES);
                     simd.store(ends.as_mut_ptr().add(S::LANES), simd.load_first(from.wrapping_add(S::LANES), rest));
-                    simd.load_pairs(ends.as_ptr())
+                    simd.load_pairs(ends.as_ptr(), S::LANES)
                 }
             };
-            (d[0][i], d[1][i]) = (even, odd);
+            (d[0][i], d[1][i]) = (simd.to_memory_order(even), simd.to_memory_order(odd));
         }
         let count = S::LANES.min(pitch - column);
         for (map, d) in d.into_iter().enumerate() {
