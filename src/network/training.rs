@@ -24,8 +24,9 @@ use crate::stopwatch::Stopwatch;
 /// Most shards a batch is cut into: enough to keep 16 threads busy.
 pub const MAX_SHARDS: usize = 16;
 
-/// What goes in and out between two barriers for the images that a shard takes at a time, in numbers: about half a MiB.
-const SEGMENT_NUMBERS: usize = 128 * 1024;
+/// What goes in and out between two barriers for the images that a shard takes at a time, in numbers: about 2 MiB. Less would fit the
+/// second-level cache, but the weight gradient wants several images of a small map in a call.
+const SEGMENT_NUMBERS: usize = 512 * 1024;
 
 /// Activations of the images that a shard takes at a time, in numbers, in networks without a barrier: about 1 MiB.
 const GROUP_NUMBERS: usize = 256 * 1024;
