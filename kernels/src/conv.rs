@@ -2,6 +2,7 @@
 //!
 //! | pass | algorithm |
 //! |---|---|
+//! | all three, where it gains | the same sums at points of the rows: minimal filtering takes half to two thirds of the products (`winograd`, which says for which shapes) |
 //! | forward | a sum over taps with vectors along the output rows (`direct`), of the image itself when the stride is 1 and nothing is padded, else of a copy that is padded and split into phases (`prepare`) |
 //! | input gradient | for each phase of the input the same sum over the zero-padded output gradient, with the kernel turned round (`input_gradient`); where that would mostly multiply zeros, a matrix product and [`crate::im2col::col2im`] |
 //! | weight gradient | vectors along the output rows, summed over lanes at the end (`weight_gradient`) |
@@ -19,6 +20,7 @@ mod weight_gradient;
 mod winograd;
 
 use crate::Isa;
+use crate::simd::MOST_LANES;
 use direct::{Band, TapSum};
 use input_gradient::InputGradient;
 use prepare::Layout;
@@ -28,8 +30,6 @@ pub use shape::ConvShape;
 const FORWARD_COPIES: usize = 1 << 16;
 /// The same for the weight gradient: 2 MiB. It sums over lanes once a group, so groups should be large.
 const GRADIENT_COPIES: usize = 1 << 19;
-/// The most lanes a vector has; copies end in as many zeros, so that whole vectors may be read.
-const MOST_LANES: usize = 16;
 
 /// How many images of `image` elements are copied at a time, within a budget of elements.
 fn group_of(image: usize, budget: usize) -> usize {
@@ -44,7 +44,7 @@ pub struct Conv {
     layout: Layout,
     sum: TapSum,
     input_gradient: InputGradient,
-    /// The passes that gain by minimal filtering.
+    /// The passes that gain by minimal filtering, in place of those above.
     fast_forward: Option<winograd::Forward>,
     fast_input_gradient: Option<winograd::InputGradient>,
     fast_weight_gradient: Option<winograd::WeightGradient>,

@@ -1,6 +1,7 @@
 //! The passes of batch normalisation (Ioffe and Szegedy 2015) over `[n][c][hw]` tensors.
 //!
-//! Sums are taken in `f64`: the variance is a difference of two sums, and several shards of a batch are added up.
+//! Sums are taken in `f32` over short strips, less the plane's first element, and added up in `f64`: the variance is a difference
+//! of two sums, and several shards of a batch are added up.
 
 use crate::simd::{Simd, get};
 

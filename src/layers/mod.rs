@@ -202,7 +202,12 @@ pub struct Grads<'a> {
     pub scratch: &'a mut [f32],
 }
 
-/// A layer that reads its parameters in another order than they are kept in.
+/// A layer that reads its parameters in another order than they are kept in: one for evaluation, and one for training, where the
+/// input gradient needs them too.
+///
+/// # Panics
+///
+/// Methods panic if `prepared` has another length than is said here, or was prepared for the other purpose and so has.
 pub trait Prepared {
     /// How many numbers the prepared parameters are.
     fn prepared_len(&self) -> usize;

@@ -60,8 +60,12 @@ impl PooledConv {
         }
     }
 
-    /// The pass must have its [`Pass::prepared`]. Overwrites `y`, and `starts`, as long as `y`, with where the window of the convolution that was largest begins in a
+    /// Overwrites `y`, and `starts`, as long as `y`, with where the window of the convolution that was largest begins in a
     /// plane of the image.
+    ///
+    /// # Panics
+    ///
+    /// If the pass has no [`Pass::prepared`]: unlike a layer, it does not prepare the weights itself.
     pub fn forward(&self, pass: &Pass, n: usize, x: &[f32], y: &mut [f32], starts: &mut [u32], scratch: &mut [f32]) {
         let (map, scratch) = scratch.split_at_mut(self.pool.c * self.pool.h * self.pool.w);
         let (pooled, scratch) = scratch.split_at_mut(self.output_len());

@@ -5,6 +5,8 @@
 
 mod inference;
 mod observation;
+mod passes;
+mod shard;
 mod spec;
 mod stages;
 mod step_profile;

@@ -73,7 +73,7 @@ impl Stage {
         }
     }
 
-    /// Evaluation with prepared parameters, if it has that.
+    /// Its passes with prepared parameters, if it has those.
     pub fn prepared<'a>(&'a self, network: &'a Network) -> Option<&'a dyn Prepared> {
         match &self.kind {
             Kind::Layer => network.layers()[self.layers.start].layer.prepared(),
@@ -121,6 +121,19 @@ pub(super) fn stages(network: &Network) -> Vec<Stage> {
     stages
 }
 
+/// Whether the gradient of the stage's input takes the place of that input.
+pub(super) fn replaces_input(network: &Network, stages: &[Stage], index: usize) -> bool {
+    let Some(source) = stages[index].source else { return false };
+    match &stages[index].kind {
+        Kind::NormRectify(_) => true,
+        Kind::PooledConv(_) => false,
+        Kind::Layer => {
+            let layer = &network.layers()[stages[index].layers.start].layer;
+            layer.linear().is_some() && stages[source].forgets_output(network)
+        }
+    }
+}
+
 /// The layers at the start of `layers` that a [`NormRectify`] stands for, and how many they are.
 fn norm_rectify(network: &Network, layers: &[NamedLayer]) -> Option<(usize, NormRectify)> {
     let LayerSpec::BatchNorm { epsilon, running_old_weight } = layers.first()?.spec else { return None };
@@ -163,6 +176,7 @@ fn pooled_conv(network: &Network, layers: &[NamedLayer]) -> Option<PooledConv> {
 mod tests {
     use steersman_kernels::Isa;
 
+    use super::super::training::{GROUP_LIMITS, GroupLimits};
     use super::super::{Parameters, StepInput, TrainingPlan};
     use super::*;
     use crate::loss::Loss;
@@ -185,7 +199,7 @@ mod tests {
     }
 
     /// Loss, gradient and parameters after a step.
-    fn step(network: &Network, stages: Vec<Stage>, images: usize) -> (f64, Vec<f32>, Parameters) {
+    fn step(network: &Network, stages: Vec<Stage>, images: usize, limits: GroupLimits) -> (f64, Vec<f32>, Parameters) {
         let mut random = rng(3, Purpose::Test, 0, 0);
         let mut draw = |len: usize| (0..len).map(|_| uniform(&mut random, -1.0, 1.0) as f32).collect::<Vec<f32>>();
         let (x, labels) = (draw(images * network.input().len()), draw(images));
@@ -193,7 +207,7 @@ mod tests {
         // Off their first values, so that slopes are not 0 and scales not 1.
         parameters.values.iter_mut().zip(draw(network.count(true))).for_each(|(p, d)| *p += 0.2 * d);
         parameters.statistics.iter_mut().zip(draw(network.count(false))).for_each(|(p, d)| *p += 0.2 * d);
-        let mut plan = TrainingPlan::with_stages(network, images, stages);
+        let mut plan = TrainingPlan::with_stages(network, images, stages, limits);
         let input = StepInput { x: &x, labels: &labels, seed: 1, step: 0 };
         let loss = plan.step(network, &mut parameters, &Loss::default(), input);
         (loss, plan.gradient().to_vec(), parameters)
@@ -235,6 +249,7 @@ mod tests {
                 let network = fresh();
                 assert_eq!(stages(&network).iter().filter(|stage| stage.layers.len() > 1).count(), fused, "{layers}");
                 agrees(&network, &format!("{layers} on {}", isa.name()));
+                agrees_in_groups(&network, &format!("{layers} in groups on {}", isa.name()));
                 for frozen in [&["conv1"][..], &["bn1"], &["conv1", "bn1"], &["conv2"]] {
                     let names: Vec<String> = frozen.iter().map(|name| name.to_string()).collect();
                     let mut network = fresh();
@@ -249,8 +264,28 @@ mod tests {
 
     /// The stages of `network` make the same step as its layers one by one.
     fn agrees(network: &Network, what: &str) {
-        let (loss, gradient, parameters) = step(network, stages(network), 19);
-        let (plain_loss, plain_gradient, plain_parameters) = step(network, layer_by_layer(network), 19);
+        let stages_step = step(network, stages(network), 19, GROUP_LIMITS);
+        same(network, what, stages_step, step(network, layer_by_layer(network), 19, GROUP_LIMITS));
+    }
+
+    /// Shards of 5 images make the same step with 1 or 2 images at a time as with all.
+    fn agrees_in_groups(network: &Network, what: &str) {
+        let all = GroupLimits { segment_numbers: usize::MAX, group_numbers: usize::MAX, min_group: 5 };
+        let whole = step(network, stages(network), 80, all);
+        for images in [1, 2] {
+            let numbers = |limit: usize| images * limit;
+            let widest = stages(network).iter().map(|stage| stage.input_len(network) + stage.output_len(network)).max();
+            let limits =
+                GroupLimits { segment_numbers: numbers(widest.unwrap_or(1)), group_numbers: 1, min_group: images };
+            same(network, what, step(network, stages(network), 80, limits), whole.clone());
+        }
+    }
+
+    type Step = (f64, Vec<f32>, Parameters);
+
+    fn same(network: &Network, what: &str, step: Step, plain: Step) {
+        let (loss, gradient, parameters) = step;
+        let (plain_loss, plain_gradient, plain_parameters) = plain;
         approx::assert_relative_eq!(loss, plain_loss, max_relative = 1e-5);
         let squares = |range: Range<usize>| plain_gradient[range].iter().map(|g| g * g).sum::<f32>();
         for tensor in network.tensors().iter().filter(|tensor| tensor.trainable && !tensor.frozen) {

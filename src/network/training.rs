@@ -9,30 +9,37 @@
 //! forward *and* backward, and needs buffers for no more of them.
 
 use std::ops::Range;
-use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use rayon::prelude::*;
 use steersman_kernels::{Isa, update};
 
-use super::stages::{Kind, Stage, stages};
+use super::passes::Run;
+use super::shard::{Buffers, Shard, Spare, groups, total};
+use super::stages::{Stage, replaces_input, stages};
 use super::step_profile::{StageTime, StepTimes};
 use super::{Network, Parameters};
-use crate::layers::{BatchStatistics, Grads, Pair, Pass};
+use crate::layers::BatchStatistics;
 use crate::loss::Loss;
 use crate::stopwatch::Stopwatch;
 
 /// Most shards a batch is cut into: enough to keep 16 threads busy.
 pub const MAX_SHARDS: usize = 16;
 
-/// What goes in and out between two barriers for the images that a shard takes at a time, in numbers: about 2 MiB. Less would fit the
-/// second-level cache, but the weight gradient wants several images of a small map in a call.
-const SEGMENT_NUMBERS: usize = 512 * 1024;
+/// How many images a shard takes at a time.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct GroupLimits {
+    /// What goes in and out between two barriers, in numbers.
+    pub segment_numbers: usize,
+    /// All activations, in numbers, in networks without a barrier.
+    pub group_numbers: usize,
+    /// Fewest images in networks without a barrier, if the shard has as many.
+    pub min_group: usize,
+}
 
-/// Activations of the images that a shard takes at a time, in numbers, in networks without a barrier: about 1 MiB.
-const GROUP_NUMBERS: usize = 256 * 1024;
-
-/// Fewest images that a shard takes at a time, if it has as many: kernels prepare their weights once a call.
-const MIN_GROUP: usize = 8;
+/// About 2 MiB between barriers: less would fit the second-level cache, but the weight gradient wants several images of a small map
+/// in a call. About 1 MiB without barriers, but 8 images, because the weight gradient has a cost for each call.
+pub(super) const GROUP_LIMITS: GroupLimits =
+    GroupLimits { segment_numbers: 512 * 1024, group_numbers: 256 * 1024, min_group: 8 };
 
 /// Parameters that are reduced and updated as one task.
 pub const CHUNK: usize = 4096;
@@ -81,69 +88,18 @@ pub struct TrainingPlan {
     times: StepTimes,
 }
 
-#[derive(Debug)]
-struct Shard {
-    /// Which images of the batch.
-    images: Range<usize>,
-    /// Empty between the steps of a network without a barrier.
-    buffers: Buffers,
-    /// Empty while the shard is not worked on.
-    scratch: Vec<f32>,
-    /// The image whose activations come first in the buffers.
-    first: usize,
-    gradient: Vec<f32>,
-    sums: Vec<f64>,
-    /// The same of the images that are being worked on.
-    group_sums: Vec<f64>,
-    /// Sum of the losses of all images.
-    loss: f64,
-}
-
-/// The maps of a shard. With a barrier the activations have to wait there, and each shard has its own. Without one a shard is done
-/// with them when it is done.
-#[derive(Debug, Default)]
-struct Buffers {
-    /// Output of each stage.
-    activations: Vec<Vec<f32>>,
-    /// Where each [`Kind::PooledConv`] found its largest; empty for the others.
-    places: Vec<Vec<u32>>,
-    /// Gradient with respect to the current stage's output, and to its input.
-    d_output: Vec<f32>,
-    d_input: Vec<f32>,
-    /// Whether the gradient with respect to the current stage's output has taken the place of that output instead.
-    in_place: bool,
-}
-
-/// Buffers that are not in use. Those put back last are taken first, so that no more are ever touched than threads are at work,
-/// and they are still in the cache.
-#[derive(Debug)]
-struct Spare<T>(Mutex<Vec<T>>);
-
-impl<T> Spare<T> {
-    fn new(items: Vec<T>) -> Spare<T> {
-        Spare(Mutex::new(items))
-    }
-
-    fn take(&self) -> T {
-        self.items().pop().expect("there are as many as shards")
-    }
-
-    fn put(&self, item: T) {
-        self.items().push(item);
-    }
-
-    fn items(&self) -> MutexGuard<'_, Vec<T>> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-}
-
 impl TrainingPlan {
     /// Buffers for batches of up to `capacity` images.
     pub fn new(network: &Network, capacity: usize) -> TrainingPlan {
-        TrainingPlan::with_stages(network, capacity, stages(network))
+        TrainingPlan::with_stages(network, capacity, stages(network), GROUP_LIMITS)
     }
 
-    pub(super) fn with_stages(network: &Network, capacity: usize, stages: Vec<Stage>) -> TrainingPlan {
+    pub(super) fn with_stages(
+        network: &Network,
+        capacity: usize,
+        stages: Vec<Stage>,
+        limits: GroupLimits,
+    ) -> TrainingPlan {
         let mut moments_of = Vec::new();
         let mut segment_starts = vec![0];
         let (mut moments_end, mut sums_len) = (0, 0);
@@ -171,10 +127,10 @@ impl TrainingPlan {
         let group = if segments.len() > 1 {
             shard_capacity
         } else {
-            (GROUP_NUMBERS / per_image.max(1)).clamp(MIN_GROUP.min(shard_capacity), shard_capacity)
+            (limits.group_numbers / per_image.max(1)).clamp(limits.min_group.min(shard_capacity), shard_capacity)
         };
         let segment_groups = (0..segments.len())
-            .map(|segment| segment_group(network, &stages, &segments, segment).unwrap_or(shard_capacity))
+            .map(|segment| segment_group(network, &stages, &segments, segment, limits).unwrap_or(shard_capacity))
             .map(|images| images.min(shard_capacity))
             .collect();
         let scratch_len = stages.iter().map(|stage| stage.scratch_len(network, group)).max().unwrap_or(0);
@@ -453,248 +409,20 @@ impl TrainingPlan {
     }
 }
 
-impl Shard {
-    fn reset(&mut self) {
-        self.gradient.fill(0.0);
-        self.loss = 0.0;
-    }
-
-    /// Takes scratch for the images between two barriers.
-    fn begin_segment(&mut self, spare_scratch: &Spare<Vec<f32>>) {
-        self.scratch = spare_scratch.take();
-        self.first = self.images.start;
-        self.sums.fill(0.0);
-    }
-
-    /// Adds the sums of a group.
-    fn add_group_sums(&mut self, len: usize) {
-        for (sum, group) in self.sums[..len].iter_mut().zip(&self.group_sums) {
-            *sum += group;
-        }
-    }
-
-    /// How many images the activations have room for.
-    fn group_capacity(&self, network: &Network) -> usize {
-        self.buffers.activations.last().map_or(self.images.len(), |last| last.len() / network.output().len()).max(1)
-    }
-
-    /// Output of stage `stage` and of its source, which comes before it.
-    fn source_and_output(&mut self, stage: usize, source: usize) -> (&mut [f32], &mut [f32]) {
-        let (before, from_here) = self.buffers.activations.split_at_mut(stage);
-        (&mut before[source], &mut from_here[0])
-    }
-}
-
-/// `images`, `group` at a time.
-fn groups(images: Range<usize>, group: usize) -> impl Iterator<Item = Range<usize>> {
-    images.clone().step_by(group).map(move |start| start..(start + group).min(images.end))
-}
-
 /// How many images should go through a segment at a time: `None` where they cannot be told apart, because a gradient on the way
 /// back leaves its place among the activations.
-fn segment_group(network: &Network, stages: &[Stage], segments: &[Range<usize>], segment: usize) -> Option<usize> {
+fn segment_group(
+    network: &Network,
+    stages: &[Stage],
+    segments: &[Range<usize>],
+    segment: usize,
+    limits: GroupLimits,
+) -> Option<usize> {
     let stays = |index: usize| stages[index].source.is_none() || replaces_input(network, stages, index);
     let next = segments.get(segment + 1)?.start;
     let after_next = next + 1 < stages.len() && replaces_input(network, stages, next + 1);
     let all_stay = (segments[segment].start + 1..=next).all(stays);
     let stages = &stages[segments[segment].clone()];
     let numbers: usize = stages.iter().map(|stage| stage.input_len(network).max(stage.output_len(network))).sum();
-    (after_next && all_stay).then_some((SEGMENT_NUMBERS / numbers.max(1)).max(1))
-}
-
-/// Whether the gradient of the stage's input takes the place of that input.
-fn replaces_input(network: &Network, stages: &[Stage], index: usize) -> bool {
-    let Some(source) = stages[index].source else { return false };
-    match &stages[index].kind {
-        Kind::NormRectify(_) => true,
-        Kind::PooledConv(_) => false,
-        Kind::Layer => {
-            let layer = &network.layers()[stages[index].layers.start].layer;
-            layer.linear().is_some() && stages[source].forgets_output(network)
-        }
-    }
-}
-
-/// Adds the shards' sums up, in their order.
-fn total<'a>(shards: &[Shard], len: usize, sums: &'a mut [f64]) -> &'a [f64] {
-    let sums = &mut sums[..len];
-    sums.fill(0.0);
-    for shard in shards {
-        for (total, sum) in sums.iter_mut().zip(&shard.sums) {
-            *total += sum;
-        }
-    }
-    sums
-}
-
-/// What all shards share during a pass.
-#[derive(Clone, Copy)]
-struct Run<'a> {
-    network: &'a Network,
-    parameters: &'a Parameters,
-    stages: &'a [Stage],
-    prepared: &'a [Vec<f32>],
-    moments: &'a [f32],
-    moments_of: &'a [Range<usize>],
-    first_learning: usize,
-    input: StepInput<'a>,
-    times: &'a StepTimes,
-}
-
-impl<'a> Run<'a> {
-    fn pass(&self, stage: usize, first_image: usize) -> Pass<'a> {
-        let moments = &self.moments[self.moments_of[stage].clone()];
-        let layer = self.stages[stage].layers.start;
-        Pass {
-            seed: self.input.seed,
-            step: self.input.step,
-            layer,
-            first_image,
-            moments,
-            prepared: &self.prepared[stage],
-        }
-    }
-
-    fn params(&self, stage: usize) -> &'a [f32] {
-        &self.parameters.values[self.stages[stage].params(self.network)]
-    }
-
-    /// The input of `stage` for `images` of the batch; `first` is that whose activations come first.
-    fn stage_input<'b>(
-        &self,
-        stage: usize,
-        activations: &'b [Vec<f32>],
-        first: usize,
-        images: Range<usize>,
-    ) -> &'b [f32]
-    where
-        'a: 'b,
-    {
-        let len = self.stages[stage].input_len(self.network);
-        match self.stages[stage].source {
-            Some(source) => &activations[source][(images.start - first) * len..][..images.len() * len],
-            None => &self.input.x[images.start * len..images.end * len],
-        }
-    }
-
-    fn forward(&self, stages: Range<usize>, shard: &mut Shard, images: Range<usize>) {
-        for index in stages {
-            let stage = &self.stages[index];
-            let (before, from_here) = shard.buffers.activations.split_at_mut(index);
-            let x = self.stage_input(index, before, shard.first, images.clone());
-            let (n, before) = (images.len(), images.start - shard.first);
-            let outputs = stage.output_len(self.network);
-            let y = &mut from_here[0][before * outputs..][..n * outputs];
-            let (params, pass) = (self.params(index), self.pass(index, images.start));
-            self.times.stages[index][0].time(|| match &stage.kind {
-                Kind::Layer => {
-                    let layer = &self.network.layers()[stage.layers.start].layer;
-                    layer.forward(params, &pass, n, x, y, &mut shard.scratch);
-                }
-                Kind::NormRectify(fused) => fused.forward(params, &pass, n, x, y),
-                Kind::PooledConv(fused) => {
-                    let places = &mut shard.buffers.places[index][before * outputs..][..n * outputs];
-                    fused.forward(&pass, n, x, y, places, &mut shard.scratch);
-                }
-            });
-        }
-    }
-
-    /// Adds the images' losses to the shard's, and puts the gradient of the mean loss into `d_output`.
-    fn loss(&self, loss: &Loss, shard: &mut Shard, images: Range<usize>) {
-        let outputs = self.network.output().len();
-        let predictions = match shard.buffers.activations.last() {
-            Some(last) => &last[..images.len() * outputs],
-            None => &self.input.x[images.start * outputs..images.end * outputs],
-        };
-        let labels = &self.input.labels[images.start * outputs..images.end * outputs];
-        let scale = 1.0 / self.input.labels.len() as f32;
-        shard.loss +=
-            loss.value_and_gradient(predictions, labels, scale, &mut shard.buffers.d_output[..predictions.len()]);
-        shard.buffers.in_place = false;
-    }
-
-    /// Takes the gradient of the output of the last of `stages` back to the input of the first.
-    fn backward(&self, stages: Range<usize>, shard: &mut Shard, images: Range<usize>) {
-        for index in stages.rev().filter(|index| *index >= self.first_learning) {
-            let stage = &self.stages[index];
-            let n = images.len();
-            let before = images.start - shard.first;
-            let place = |len: usize| before * len..(before + n) * len;
-            let (of_x, of_y) = (place(stage.input_len(self.network)), place(stage.output_len(self.network)));
-            let (params, pass) = (self.params(index), self.pass(index, images.start));
-            let replaces = stage.source.filter(|_| replaces_input(self.network, self.stages, index));
-            // Nobody asks for the gradient of the images themselves, or of what comes before all that learns.
-            let wanted = stage.source.filter(|source| *source >= self.first_learning);
-            self.times.stages[index][1].time(|| match &stage.kind {
-                Kind::NormRectify(fused) => {
-                    let source = replaces.expect("batch norm runs fused only after another stage");
-                    let (in_place, d_output) = (shard.buffers.in_place, std::mem::take(&mut shard.buffers.d_output));
-                    let (x, y) = shard.source_and_output(index, source);
-                    let dy = if in_place { &y[of_y] } else { &d_output[of_y] };
-                    fused.backward(params, &pass, n, &mut x[of_x], dy);
-                    shard.buffers.d_output = d_output;
-                }
-                Kind::PooledConv(fused) => {
-                    let x = self.stage_input(index, &shard.buffers.activations, shard.first, images.clone());
-                    let y = &shard.buffers.activations[index][of_y.clone()];
-                    let pair = Pair { x, y, dy: &shard.buffers.d_output[of_y.clone()] };
-                    let dx = wanted.map(|_| &mut shard.buffers.d_input[of_x]);
-                    let dparams = &mut shard.gradient[stage.params(self.network)];
-                    let grads = Grads { dparams, scratch: &mut shard.scratch };
-                    fused.backward(params, n, pair, &shard.buffers.places[index][of_y], dx, grads);
-                }
-                Kind::Layer => {
-                    let layer = &self.network.layers()[stage.layers.start].layer;
-                    let x = self.stage_input(index, &shard.buffers.activations, shard.first, images.clone());
-                    let y = &shard.buffers.activations[index][of_y.clone()];
-                    let dy = if shard.buffers.in_place { y } else { &shard.buffers.d_output[of_y.clone()] };
-                    let pair = Pair { x, y, dy };
-                    let apart = wanted.is_some() && replaces.is_none();
-                    let dx = if apart { Some(&mut shard.buffers.d_input[of_x.clone()]) } else { None };
-                    let dparams = &mut shard.gradient[stage.params(self.network)];
-                    layer.backward(params, &pass, n, pair, dx, Grads { dparams, scratch: &mut shard.scratch });
-                    if let (Some(linear), Some(source)) = (layer.linear(), replaces.and(wanted)) {
-                        let (before, from_here) = shard.buffers.activations.split_at_mut(index);
-                        let dy =
-                            if shard.buffers.in_place { &from_here[0][of_y] } else { &shard.buffers.d_output[of_y] };
-                        linear.backward_input(params, &pass, n, dy, &mut before[source][of_x], &mut shard.scratch);
-                    }
-                }
-            });
-            shard.buffers.in_place = replaces.is_some();
-            if !shard.buffers.in_place {
-                std::mem::swap(&mut shard.buffers.d_output, &mut shard.buffers.d_input);
-            }
-        }
-    }
-
-    /// Adds the sums over the images that the barrier is for to the shard's.
-    fn forward_sums(&self, stage: usize, barrier: &dyn BatchStatistics, shard: &mut Shard, images: Range<usize>) {
-        let x = self.stage_input(stage, &shard.buffers.activations, shard.first, images.clone());
-        let sums = &mut shard.group_sums[..barrier.sums_len()];
-        self.times.stages[stage][0].time(|| barrier.forward_sums(images.len(), x, sums));
-        shard.add_group_sums(barrier.sums_len());
-    }
-
-    /// The same on the way back.
-    fn backward_sums(&self, index: usize, barrier: &dyn BatchStatistics, shard: &mut Shard, images: Range<usize>) {
-        let stage = &self.stages[index];
-        let n = images.len();
-        let x = self.stage_input(index, &shard.buffers.activations, shard.first, images.clone());
-        let outputs = stage.output_len(self.network);
-        let of_y = (images.start - shard.first) * outputs..(images.end - shard.first) * outputs;
-        let dy = if shard.buffers.in_place {
-            &shard.buffers.activations[index][of_y]
-        } else {
-            &shard.buffers.d_output[of_y]
-        };
-        let sums = &mut shard.group_sums[..barrier.sums_len()];
-        let moments = self.pass(index, images.start).moments;
-        let dparams = &mut shard.gradient[stage.params(self.network)];
-        self.times.stages[index][1].time(|| match &stage.kind {
-            Kind::Layer | Kind::PooledConv(_) => barrier.backward_sums(moments, n, x, dy, sums, dparams),
-            Kind::NormRectify(fused) => fused.backward_sums(self.params(index), moments, x, dy, sums, dparams),
-        });
-    }
+    (after_next && all_stay).then_some((limits.segment_numbers / numbers.max(1)).max(1))
 }

@@ -21,6 +21,9 @@ const BLOCK_TAPS: (usize, usize) = (48, 240);
 /// Elements of input, 128 KiB, that go through all blocks of taps before the next.
 const GROUP_INPUT: usize = 32_768;
 
+/// The most channels of a tile.
+pub(super) const MOST_CHANNELS: usize = 8;
+
 /// Output channels of a tile for `channels` in all: the height that leaves the fewest rows empty.
 pub(super) fn tile_height(many_registers: bool, channels: usize) -> usize {
     let heights: &[usize] = if many_registers { &[8, 6, 4] } else { &[6, 4] };
@@ -61,7 +64,7 @@ pub(crate) struct TapSum {
 impl TapSum {
     /// Elements that the packed weights and bias take for tiles of any height.
     pub fn packed_len(&self) -> usize {
-        (self.channels + 8) * (self.taps.len() + 1)
+        (self.channels + MOST_CHANNELS) * (self.taps.len() + 1)
     }
 
     /// Packs bias (none: 0) and weights into panels of a tile's channels: first the bias, then tap by tap.

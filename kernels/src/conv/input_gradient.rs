@@ -11,11 +11,11 @@
 use super::direct::{Band, TapSum};
 use super::grid::Span;
 use super::prepare::put_every;
-use super::{ConvShape, FORWARD_COPIES, MOST_LANES, grid, group_of};
+use super::{ConvShape, FORWARD_COPIES, grid, group_of};
 use crate::Isa;
 use crate::gemm::{gemm, gemm_scratch_len};
 use crate::im2col::col2im;
-use crate::simd::Simd;
+use crate::simd::{MOST_LANES, Simd};
 
 /// The rows, or columns, of the input that leave one remainder.
 #[derive(Clone, Copy, Debug)]

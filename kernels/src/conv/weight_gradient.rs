@@ -5,8 +5,8 @@
 //! until the end. So that `dy` comes from the first-level cache, a chunk of `CHUNK` vectors is packed once and all taps
 //! run over it; the sums of a panel of channels wait in scratch meanwhile.
 
-use super::direct::TapSum;
-use crate::simd::{ALIGNMENT, Simd, align};
+use super::direct::{MOST_CHANNELS, TapSum};
+use crate::simd::{ALIGNMENT, MOST_LANES, Simd, align};
 
 /// Taps in a tile.
 pub(super) const TILE_TAPS: usize = 3;
@@ -18,15 +18,20 @@ const CHUNK_OF_MANY_REGISTERS: usize = 32;
 const fn chunk_vectors<S: Simd>() -> usize {
     if S::MANY_REGISTERS { CHUNK_OF_MANY_REGISTERS } else { MOST_CHUNK }
 }
-/// The most lanes and channels a tile has on any instruction set.
-const MOST_LANES: usize = 16;
-const MOST_CHANNELS: usize = 8;
 /// The most vectors of a packed chunk: 32 of 8 channels; 64 of 4, where there are 16 registers, are as many.
 const MOST_PACKED: usize = CHUNK_OF_MANY_REGISTERS * MOST_CHANNELS;
 
 /// Elements of scratch for `taps` taps.
 pub(crate) fn scratch_len(taps: usize) -> usize {
     (MOST_PACKED + taps.next_multiple_of(TILE_TAPS) * MOST_CHANNELS) * MOST_LANES + ALIGNMENT
+}
+
+/// Channels of a tile for `channels` in all: the height that leaves the fewest rows empty, of 24 or 18 accumulators, or 12 or 9
+/// where there are 16 registers.
+pub(super) fn tile_height(many_registers: bool, channels: usize) -> usize {
+    let heights = if many_registers { [8, 6] } else { [4, 3] };
+    let rows = |height: usize| channels.div_ceil(height) * height;
+    if rows(heights[0]) <= rows(heights[1]) { heights[0] } else { heights[1] }
 }
 
 /// Adds the gradient of the images in `dy` to `dweight` and `dbias`.
@@ -42,10 +47,7 @@ pub(crate) fn run<S: Simd>(
     dbias: &mut [f32],
     scratch: &mut [f32],
 ) {
-    // The height that leaves the fewest rows empty: 24 or 18 accumulators, or 12 or 9 where there are 16 registers.
-    let heights = if S::MANY_REGISTERS { [8, 6] } else { [4, 3] };
-    let rows = |height: usize| sum.channels.div_ceil(height) * height;
-    match if rows(heights[0]) <= rows(heights[1]) { heights[0] } else { heights[1] } {
+    match tile_height(S::MANY_REGISTERS, sum.channels) {
         8 if S::MANY_REGISTERS => run_height::<S, 8>(simd, sum, x, dy, dweight, dbias, scratch),
         6 if S::MANY_REGISTERS => run_height::<S, 6>(simd, sum, x, dy, dweight, dbias, scratch),
         4 => run_height::<S, 4>(simd, sum, x, dy, dweight, dbias, scratch),

@@ -5,7 +5,7 @@ use super::{
 };
 use crate::simd::{Simd, get_first, put_first, put_pairs};
 
-/// Vectors that are summed in single precision before their sum is added up in double.
+/// Vectors that are summed in single precision before their sum is added up in double; a strip ends with a row.
 const STRIP: usize = 32;
 
 /// What the gradient of one channel needs.

@@ -61,7 +61,7 @@ fn largest<S: Simd, const SLOPES: u8>(simd: S, z: [S::V; 4], slopes: [S::V; 4]) 
     }
     let mut most = if SLOPES == ZERO { simd.splat(0.0) } else { f[0] };
     for f in f {
-        // In this order NaN does not count.
+        // In this order NaN does not count, unless with slopes it comes first.
         most = simd.max(f, most);
     }
     (f, most)

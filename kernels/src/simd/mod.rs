@@ -13,6 +13,9 @@ pub(crate) mod x86;
 /// Elements in a cache line: a vector that crosses from one line into the next costs two loads.
 pub(crate) const ALIGNMENT: usize = 16;
 
+/// The most lanes a vector has on any instruction set.
+pub(crate) const MOST_LANES: usize = 16;
+
 /// The part of `scratch` that begins on a cache line; up to `ALIGNMENT` elements are lost.
 #[inline(always)]
 pub(crate) fn align(scratch: &mut [f32]) -> &mut [f32] {

@@ -48,7 +48,10 @@ const CASES: &[Case] = &[
     ([5, 12, 75, 7], [3, 4], [1, 1], [1, 1, 2, 1]),
     ([4, 21, 60, 9], [5, 5], [2, 2], [1, 2, 1, 2]),
     ([3, 23, 47, 6], [6, 5], [2, 3], [2, 1, 0, 1]),
-    ([4, 19, 9, 5], [7, 3], [3, 1], [0, 0, 4, 4]),
+    ([4, 40, 14, 5], [7, 3], [3, 1], [0, 0, 4, 4]),
+    ([64, 62, 70, 8], [3, 3], [1, 1], [0; 4]),
+    ([3, 37, 60, 8], [5, 5], [2, 2], [0; 4]),
+    ([6, 2, 100, 8], [3, 3], [1, 1], [0, 2, 0, 0]),
     // A kernel that does not fit: no output.
     ([2, 2, 2, 3], [3, 3], [1, 1], [0; 4]),
 ];
@@ -86,9 +89,17 @@ fn convolutions_agree_with_the_loops() {
                 let mut actual = nans(n * y_len);
                 conv.forward(n, &x, &weight, &bias, &mut actual, &mut nans(conv.scratch_len()));
                 failures.compare(&format!("forward {what}"), &actual, &y, 1e-5);
+                let (mut packed, plain) = (nans(conv.packed_len()), actual.clone());
+                conv.pack(&weight, &bias, &mut packed);
+                conv.forward_packed(n, &x, &packed, &mut actual, &mut nans(conv.scratch_len()));
+                assert_eq!(actual, plain, "forward_packed {what}");
                 let mut actual = nans(n * x_len);
                 conv.backward_input(n, &dy, &weight, &mut actual, &mut nans(conv.scratch_len()));
                 failures.compare(&format!("backward_input {what}"), &actual, &dx, 1e-5);
+                let (mut packed, plain) = (nans(conv.packed_gradient_len()), actual.clone());
+                conv.pack_gradient(&weight, &mut packed);
+                conv.backward_input_packed(n, &dy, &packed, &mut actual, &mut nans(conv.scratch_len()));
+                assert_eq!(actual, plain, "backward_input_packed {what}");
                 let (mut actual, mut actual_bias) = (weight.clone(), bias.clone());
                 let scratch = &mut nans(conv.scratch_len());
                 conv.backward_weight(n, &x, &dy, &mut actual, &mut actual_bias, scratch);

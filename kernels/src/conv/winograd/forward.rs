@@ -2,7 +2,7 @@
 
 use super::input_points::InputPoints;
 use super::point_sum::{PointSum, Target};
-use super::strips::{Strips, head};
+use super::strips::head;
 use super::{BUDGET, FEWEST_TAPS};
 use crate::conv::ConvShape;
 use crate::simd::{ALIGNMENT, Simd, align};
@@ -17,10 +17,8 @@ pub(crate) struct Forward {
 impl Forward {
     /// The pass over `shape`, if it gains.
     pub fn new(shape: ConvShape) -> Option<Forward> {
-        let strips = |[rows, height, pitch, reach, planes]: [usize; 5]| {
-            Strips::new(rows, height, pitch, reach, |tile| BUDGET / ((rows + 2) * planes * tile))
-        };
-        let (input, taps) = InputPoints::new(shape, strips)?;
+        let most = |rows: usize, planes: usize, positions: usize| BUDGET / ((rows + 2) * planes * positions);
+        let (input, taps) = InputPoints::new(shape, most)?;
         if taps.len() < FEWEST_TAPS {
             return None;
         }

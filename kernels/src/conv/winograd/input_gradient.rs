@@ -37,9 +37,9 @@ impl InputGradient {
         }
         // The sum leaves out most of the zeros beyond the border.
         let direct = shape.out_h() * kh;
-        let tile = rows_per_tile(height, &all_rows.iter().map(|phase| phase.taps).collect::<Vec<_>>(), direct)?;
+        let tile_rows = rows_per_tile(height, &all_rows.iter().map(|phase| phase.taps).collect::<Vec<_>>(), direct)?;
         let pitch = left + end(&all_columns).max(shape.out_w());
-        let strips = Strips::new(tile, height, pitch, left + 1, |positions| BUDGET / ((tile + 2) * oc * positions));
+        let strips = Strips::new(tile_rows, height, pitch, left + 1, BUDGET / ((tile_rows + 2) * oc * pitch));
         let part = |rows: Remainder, columns: Remainder| {
             let (mut offsets, mut weights) = (Vec::new(), Vec::new());
             for o in 0..oc {
@@ -62,7 +62,7 @@ impl InputGradient {
                 column_step: stride_w,
                 map: h * w,
             };
-            let taps = Taps { offsets, weights, weight_stride: kh * kw, phases: vec![phase] };
+            let taps = Taps::new(offsets, weights, kh * kw, vec![phase]);
             PointSum { taps, channels: c, stride: oc * strips.plane, target }
         };
         let parts = all_rows.iter().flat_map(|&rows| all_columns.iter().map(move |&columns| (rows, columns)));

@@ -17,16 +17,18 @@ pub(super) struct Taps {
     pub weights: Vec<usize>,
     pub weight_stride: usize,
     pub phases: Vec<Phase>,
+    /// The largest offset.
+    pub farthest: usize,
 }
 
 impl Taps {
-    pub fn len(&self) -> usize {
-        self.offsets.len()
+    pub fn new(offsets: Vec<usize>, weights: Vec<usize>, weight_stride: usize, phases: Vec<Phase>) -> Taps {
+        let farthest = offsets.iter().max().copied().unwrap_or(0);
+        Taps { offsets, weights, weight_stride, phases, farthest }
     }
 
-    /// The largest offset.
-    pub fn farthest(&self) -> usize {
-        self.offsets.iter().max().copied().unwrap_or(0)
+    pub fn len(&self) -> usize {
+        self.offsets.len()
     }
 }
 
@@ -52,9 +54,9 @@ pub(super) struct InputPoints {
 }
 
 impl InputPoints {
-    /// The points of `shape` and the taps on them, if it gains; `strips` is given the rows of a tile, the height, the pitch, the
-    /// reach of the taps and the number of planes.
-    pub fn new(shape: ConvShape, strips: impl FnOnce([usize; 5]) -> Strips) -> Option<(InputPoints, Taps)> {
+    /// The points of `shape` and the taps on them, if it gains. `most` tells from the rows of a tile, the planes of a point and the
+    /// positions of a tile how many tiles go into a strip.
+    pub fn new(shape: ConvShape, most: impl FnOnce(usize, usize, usize) -> usize) -> Option<(InputPoints, Taps)> {
         let ConvShape { c, kh, kw, stride_h, stride_w, .. } = shape;
         let (row_phases, column_phases) = (stride_h.min(kh), stride_w.min(kw));
         let rows_of = |phase: usize| (kh - phase).div_ceil(stride_h);
@@ -64,7 +66,8 @@ impl InputPoints {
         let rows = rows_per_tile(shape.out_h(), &(0..row_phases).map(rows_of).collect::<Vec<_>>(), shape.out_h() * kh)?;
         let layout = Layout::new(shape);
         let planes = c * row_phases * column_phases;
-        let strips = strips([rows, shape.out_h(), layout.pitch, kw.div_ceil(stride_w), planes]);
+        let most = most(rows, planes, layout.pitch);
+        let strips = Strips::new(rows, shape.out_h(), layout.pitch, kw.div_ceil(stride_w), most);
         let (mut offsets, mut weights, mut phases) = (Vec::new(), Vec::new(), Vec::new());
         for phase in 0..row_phases {
             let first = offsets.len();
@@ -82,7 +85,7 @@ impl InputPoints {
                 points: 0..strips.points() - usize::from(rows < 3),
             });
         }
-        let taps = Taps { offsets, weights, weight_stride: shape.taps(), phases };
+        let taps = Taps::new(offsets, weights, shape.taps(), phases);
         let padded = shape.pad_top + shape.pad_bottom + shape.pad_left + shape.pad_right > 0;
         let pairs = !padded && [stride_h, stride_w, row_phases, column_phases] == [2; 4];
         Some((InputPoints { shape, strips, layout, pairs }, taps))

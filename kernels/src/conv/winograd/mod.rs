@@ -7,7 +7,8 @@
 //! A stride splits the rows into phases whose filters have 2 or 3 taps; all phases share the points of the output. A filter
 //! of 2 taps has no use for one of the points, and does without it.
 //!
-//! Which shapes gain is decided by [`rows_per_tile`].
+//! Which shapes gain is decided by [`rows_per_tile`], and for small maps and few channels by [`FEWEST_TAPS`] and
+//! `weight_gradient::TOO_FEW_POSITIONS`.
 
 mod forward;
 mod input_gradient;
@@ -23,7 +24,7 @@ pub(crate) use weight_gradient::WeightGradient;
 
 /// Elements of points in a strip: 512 KiB.
 const BUDGET: usize = 1 << 17;
-/// The same for the weight gradient, which sums over lanes once a strip: 2 MiB.
+/// The same for the weight gradient, which sums over lanes once a strip: 1 MiB.
 const GRADIENT_BUDGET: usize = 1 << 18;
 
 /// The fewest taps of a point at which the forward pass gains: the rows of the output are made at a cost that does not depend

@@ -10,13 +10,8 @@ use std::ops::Range;
 use super::input_points::Taps;
 use super::strips::{Strip, Strips};
 use super::transform::{self, MOST_POINTS, POINT_ONE};
-use crate::conv::direct::{tile, tile_height};
-use crate::simd::{Simd, prefetch_part};
-
-/// The most lanes a vector has.
-const MOST_LANES: usize = 16;
-/// The most channels a tile has.
-const MOST_CHANNELS: usize = 8;
+use crate::conv::direct::{MOST_CHANNELS, tile, tile_height};
+use crate::simd::{MOST_LANES, Simd, prefetch_part};
 
 /// Where the positions of the tiles lie in the output.
 #[derive(Clone, Debug)]
@@ -140,6 +135,8 @@ impl PointSum {
         out: &mut [f32],
         upcoming: &[f32],
     ) {
+        let panel_len = MR * (1 + self.taps.len() * (M + 2));
+        assert!(packed.len() >= self.channels.div_ceil(MR) * panel_len, "point sum: packed weights are too short");
         let vectors = strips.used(strip).div_ceil(S::LANES);
         let mut next = 0;
         let mut values = [[[simd.splat(0.0); 3]; MR]; MOST_POINTS];
@@ -147,14 +144,8 @@ impl PointSum {
             // Four vectors are better two and two than three and one.
             let count = match vectors - next {
                 1 => 1,
-                2 | 4 => 2,
-                _ => {
-                    if S::MANY_REGISTERS {
-                        3
-                    } else {
-                        2
-                    }
-                }
+                3 | 5.. if S::MANY_REGISTERS => 3,
+                _ => 2,
             };
             let place = Column { strips, strip, next };
             match count {
@@ -179,8 +170,7 @@ impl PointSum {
         values: &mut [[[S::V; 3]; MR]; MOST_POINTS],
     ) {
         let Column { strips, strip, next } = place;
-        assert!(S::LANES <= MOST_LANES, "point sum: vectors are too long");
-        let last = (M + 1) * self.stride + (next + NV) * S::LANES + self.taps.farthest();
+        let last = (M + 1) * self.stride + (next + NV) * S::LANES + self.taps.farthest;
         assert!(last <= points.len(), "point sum: too few points");
         let mut segments = [Segments { list: [Segment::default(); MOST_LANES], count: 0 }; NV];
         for v in 0..NV {
@@ -284,8 +274,8 @@ impl PointSum {
             let (tile, column) = (at / strips.pitch, at % strips.pitch);
             let next = end.min(at - column + strips.pitch);
             let (from, to) = (column.max(columns.start), (column + next - at).min(columns.end));
-            let (image, tile) = (tile / strip.tiles, (strip.first_tile + tile % strip.tiles) * M);
-            let (top, bottom) = (tile.max(rows.start), (tile + M).min(rows.end));
+            let (image, first_row) = (tile / strip.tiles, (strip.first_tile + tile % strip.tiles) * M);
+            let (top, bottom) = (first_row.max(rows.start), (first_row + M).min(rows.end));
             if from < to && top < bottom {
                 let out = image * self.channels * map
                     + first
@@ -297,7 +287,7 @@ impl PointSum {
                 segments.list[segments.count] = Segment {
                     lane: at - position + from - column,
                     count: to - from,
-                    rows: (top - tile, bottom - tile),
+                    rows: (top - first_row, bottom - first_row),
                     out,
                 };
                 segments.count += 1;

@@ -3,12 +3,10 @@
 use std::ops::Range;
 
 use super::transform::{self, MOST_POINTS, MOST_ROWS};
-use crate::simd::{Simd, put_first};
+use crate::simd::{MOST_LANES, Simd, put_first};
 
 /// Images that are worked on together when each has few rows.
 const MOST_IMAGES: usize = 8;
-/// The most lanes a vector has.
-const MOST_LANES: usize = 16;
 
 /// Tiles of rows, and how many of them go through a pass together.
 ///
@@ -40,17 +38,17 @@ pub(super) struct Strip {
 }
 
 impl Strips {
-    /// Cuts maps of `height` rows into tiles of `rows`, `pitch` positions wide. `most` tells how many tiles of so many positions go
-    /// into a strip. Taps shift vectors by less than `width`.
-    pub fn new(rows: usize, height: usize, pitch: usize, width: usize, most: impl FnOnce(usize) -> usize) -> Strips {
+    /// Cuts maps of `height` rows into tiles of `rows`, `pitch` positions wide, of which up to `most`, but at least one, go into a
+    /// strip. Taps shift vectors by less than `shifts`.
+    pub fn new(rows: usize, height: usize, pitch: usize, shifts: usize, most: usize) -> Strips {
         let tiles = height.div_ceil(rows);
-        let most = most(pitch).max(1);
+        let most = most.max(1);
         let per_strip = tiles.div_ceil(tiles.div_ceil(most));
         let images = if per_strip < tiles { 1 } else { (most / tiles).clamp(1, MOST_IMAGES) };
-        let reach = MOST_LANES + width;
+        let reach = MOST_LANES + shifts;
         let plane = (images * per_strip * pitch + reach).next_multiple_of(MOST_LANES);
         // An odd number of cache lines, so that the same positions of many planes do not compete for the same places.
-        let plane = if plane / MOST_LANES % 2 == 0 { plane + MOST_LANES } else { plane };
+        let plane = if (plane / MOST_LANES).is_multiple_of(2) { plane + MOST_LANES } else { plane };
         Strips { rows, tiles, pitch, per_strip, images, plane, reach }
     }
 
@@ -236,33 +234,46 @@ fn input_tile<S: Simd, const M: usize>(
 ) {
     assert!(has.end <= M + 2 && from.len() >= has.len() * width, "winograd: a row is missing");
     assert!(to.len() >= (M + 1) * stride + width, "winograd: too little room for the points");
-    let whole = width - width % S::LANES;
-    // SAFETY: `from` holds `width` elements of every row, and `to` as many at every point.
-    unsafe {
-        for column in (0..whole).step_by(S::LANES) {
-            let mut d = [simd.splat(0.0); MOST_POINTS];
-            for i in 0..M + 2 {
-                if has.contains(&i) {
-                    d[i] = simd.load(from.as_ptr().add((i - has.start) * width + column));
-                }
-            }
-            let p = transform::input::<S, M>(simd, d);
-            for u in 0..M + 2 {
-                simd.store(to.as_mut_ptr().add(u * stride + column), p[u]);
+    for column in (0..width).step_by(S::LANES) {
+        let count = S::LANES.min(width - column);
+        // SAFETY: `from` holds `width` elements of every row, and `to` as many at every point.
+        unsafe {
+            // Two calls, of which the first knows that the vectors are whole.
+            let (from, to) = (from.as_ptr().add(column), to.as_mut_ptr().add(column));
+            if count == S::LANES {
+                input_column::<S, M>(simd, from, width, &has, stride, to, S::LANES);
+            } else {
+                input_column::<S, M>(simd, from, width, &has, stride, to, count);
             }
         }
-        if whole < width {
-            let count = width - whole;
-            let mut d = [simd.splat(0.0); MOST_POINTS];
-            for i in 0..M + 2 {
-                if has.contains(&i) {
-                    d[i] = simd.load_first(from.as_ptr().add((i - has.start) * width + whole), count);
-                }
+    }
+}
+
+/// `count` positions of [`input_tile`].
+///
+/// # Safety
+/// `count` elements of each row that is there are readable, `width` apart, and as many writable at each point.
+#[inline(always)]
+unsafe fn input_column<S: Simd, const M: usize>(
+    simd: S,
+    from: *const f32,
+    width: usize,
+    has: &Range<usize>,
+    stride: usize,
+    to: *mut f32,
+    count: usize,
+) {
+    let mut d = [simd.splat(0.0); MOST_POINTS];
+    // SAFETY: as the caller promises.
+    unsafe {
+        for i in 0..M + 2 {
+            if has.contains(&i) {
+                d[i] = simd.load_first(from.add((i - has.start) * width), count);
             }
-            let p = transform::input::<S, M>(simd, d);
-            for u in 0..M + 2 {
-                simd.store_first(to.as_mut_ptr().add(u * stride + whole), p[u], count);
-            }
+        }
+        let p = transform::input::<S, M>(simd, d);
+        for u in 0..M + 2 {
+            simd.store_first(to.add(u * stride), p[u], count);
         }
     }
 }
@@ -280,8 +291,9 @@ fn pairs_tile<S: Simd, const M: usize>(
 ) {
     assert!(rows <= M + 2 && (rows == 0 || from.len() >= (2 * rows - 1) * width), "winograd: a row is missing");
     assert!(to.len() >= (M + 1) * stride + plane + pitch, "winograd: too little room for the points");
+    assert!(pitch <= width.div_ceil(2), "winograd: maps wider than their columns");
     for column in (0..pitch).step_by(S::LANES) {
-        let there = width.saturating_sub(2 * column);
+        let there = width - 2 * column;
         let mut d = [[simd.splat(0.0); MOST_POINTS]; 2];
         for i in 0..rows {
             // SAFETY: a row of `from` has as many elements as are there, and `ends` has room for two vectors.
@@ -322,29 +334,44 @@ fn output_gradient_tile<S: Simd, const M: usize>(
 ) {
     assert!(rows <= M && dy.len() >= rows * width, "winograd: a row is missing");
     assert!(to.len() >= (M + 1) * stride + width, "winograd: too little room for the points");
-    let whole = width - width % S::LANES;
-    // SAFETY: `dy` holds `width` elements of every row, and `to` as many at every point.
-    unsafe {
-        for column in (0..whole).step_by(S::LANES) {
-            let mut d = [simd.splat(0.0); MOST_ROWS];
-            for i in 0..rows {
-                d[i] = simd.load(dy.as_ptr().add(i * width + column));
-            }
-            let p = transform::output_gradient::<S, M>(simd, d);
-            for u in 0..M + 2 {
-                simd.store(to.as_mut_ptr().add(u * stride + column), p[u]);
+    for column in (0..width).step_by(S::LANES) {
+        let count = S::LANES.min(width - column);
+        // SAFETY: `dy` holds `width` elements of every row, and `to` as many at every point.
+        unsafe {
+            // Two calls, of which the first knows that the vectors are whole.
+            let (dy, to) = (dy.as_ptr().add(column), to.as_mut_ptr().add(column));
+            if count == S::LANES {
+                output_gradient_column::<S, M>(simd, dy, width, rows, stride, to, S::LANES);
+            } else {
+                output_gradient_column::<S, M>(simd, dy, width, rows, stride, to, count);
             }
         }
-        if whole < width {
-            let count = width - whole;
-            let mut d = [simd.splat(0.0); MOST_ROWS];
-            for i in 0..rows {
-                d[i] = simd.load_first(dy.as_ptr().add(i * width + whole), count);
-            }
-            let p = transform::output_gradient::<S, M>(simd, d);
-            for u in 0..M + 2 {
-                simd.store_first(to.as_mut_ptr().add(u * stride + whole), p[u], count);
-            }
+    }
+}
+
+/// `count` positions of [`output_gradient_tile`].
+///
+/// # Safety
+/// `count` elements of each of `rows` rows are readable, `width` apart, and as many writable at each point.
+#[inline(always)]
+unsafe fn output_gradient_column<S: Simd, const M: usize>(
+    simd: S,
+    dy: *const f32,
+    width: usize,
+    rows: usize,
+    stride: usize,
+    to: *mut f32,
+    count: usize,
+) {
+    let mut d = [simd.splat(0.0); MOST_ROWS];
+    // SAFETY: as the caller promises.
+    unsafe {
+        for i in 0..rows {
+            d[i] = simd.load_first(dy.add(i * width), count);
+        }
+        let p = transform::output_gradient::<S, M>(simd, d);
+        for u in 0..M + 2 {
+            simd.store_first(to.add(u * stride), p[u], count);
         }
     }
 }

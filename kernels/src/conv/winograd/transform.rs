@@ -26,6 +26,12 @@ fn add<S: Simd>(simd: S, a: S::V, b: S::V) -> S::V {
     simd.mul_add(a, simd.splat(1.0), b)
 }
 
+/// `a - b`.
+#[inline(always)]
+fn minus<S: Simd>(simd: S, a: S::V, b: S::V) -> S::V {
+    simd.mul_add(b, simd.splat(-1.0), a)
+}
+
 /// `a * factor + b`.
 #[inline(always)]
 fn scaled<S: Simd>(simd: S, a: S::V, factor: f32, b: S::V) -> S::V {
@@ -35,16 +41,15 @@ fn scaled<S: Simd>(simd: S, a: S::V, factor: f32, b: S::V) -> S::V {
 /// `B' d`: rows of the input to points.
 #[inline(always)]
 pub(super) fn input<S: Simd, const M: usize>(simd: S, d: [S::V; MOST_POINTS]) -> [S::V; MOST_POINTS] {
-    let minus = |a, b| scaled(simd, b, -1.0, a);
     if M == 2 {
-        [minus(d[0], d[2]), add(simd, d[1], d[2]), minus(d[2], d[1]), minus(d[3], d[1]), d[4], d[5]]
+        [minus(simd, d[0], d[2]), add(simd, d[1], d[2]), minus(simd, d[2], d[1]), minus(simd, d[3], d[1]), d[4], d[5]]
     } else {
         let (even, odd) = (scaled(simd, d[2], -4.0, d[4]), scaled(simd, d[1], -4.0, d[3]));
-        let (wide_even, wide_odd) = (minus(d[4], d[2]), minus(d[3], d[1]));
+        let (wide_even, wide_odd) = (minus(simd, d[4], d[2]), minus(simd, d[3], d[1]));
         [
             scaled(simd, d[0], 4.0, scaled(simd, d[2], -5.0, d[4])),
             add(simd, even, odd),
-            minus(even, odd),
+            minus(simd, even, odd),
             scaled(simd, wide_odd, 2.0, wide_even),
             scaled(simd, wide_odd, -2.0, wide_even),
             scaled(simd, d[1], 4.0, scaled(simd, d[3], -5.0, d[5])),
@@ -55,12 +60,12 @@ pub(super) fn input<S: Simd, const M: usize>(simd: S, d: [S::V; MOST_POINTS]) ->
 /// `A' m`: points to rows of the output.
 #[inline(always)]
 pub(super) fn output<S: Simd, const M: usize>(simd: S, m: [S::V; MOST_POINTS]) -> [S::V; MOST_ROWS] {
-    let (even, odd) = (add(simd, m[1], m[2]), scaled(simd, m[2], -1.0, m[1]));
+    let (even, odd) = (add(simd, m[1], m[2]), minus(simd, m[1], m[2]));
     if M == 2 {
         let zero = simd.splat(0.0);
         [add(simd, m[0], even), add(simd, m[3], odd), zero, zero]
     } else {
-        let (wide_even, wide_odd) = (add(simd, m[3], m[4]), scaled(simd, m[4], -1.0, m[3]));
+        let (wide_even, wide_odd) = (add(simd, m[3], m[4]), minus(simd, m[3], m[4]));
         [
             add(simd, add(simd, m[0], even), wide_even),
             scaled(simd, wide_odd, 2.0, odd),
@@ -73,16 +78,15 @@ pub(super) fn output<S: Simd, const M: usize>(simd: S, m: [S::V; MOST_POINTS]) -
 /// `A dy`: rows of the output's gradient to points.
 #[inline(always)]
 pub(super) fn output_gradient<S: Simd, const M: usize>(simd: S, dy: [S::V; MOST_ROWS]) -> [S::V; MOST_POINTS] {
-    let minus = |a, b| scaled(simd, b, -1.0, a);
     if M == 2 {
-        [dy[0], add(simd, dy[0], dy[1]), minus(dy[0], dy[1]), dy[1], dy[1], dy[1]]
+        [dy[0], add(simd, dy[0], dy[1]), minus(simd, dy[0], dy[1]), dy[1], dy[1], dy[1]]
     } else {
         let (even, odd) = (add(simd, dy[0], dy[2]), add(simd, dy[1], dy[3]));
         let (wide_even, wide_odd) = (scaled(simd, dy[2], 4.0, dy[0]), scaled(simd, dy[3], 4.0, dy[1]));
         [
             dy[0],
             add(simd, even, odd),
-            minus(even, odd),
+            minus(simd, even, odd),
             scaled(simd, wide_odd, 2.0, wide_even),
             scaled(simd, wide_odd, -2.0, wide_even),
             dy[3],

@@ -6,19 +6,19 @@
 
 use super::GRADIENT_BUDGET;
 use super::input_points::{InputPoints, Taps};
-use super::strips::{Strip, Strips, head};
+use super::strips::{Strip, head};
 use super::transform::{self, MOST_POINTS, POINT_ONE};
 use crate::conv::ConvShape;
-use crate::conv::weight_gradient::{TILE_TAPS, add_lanes};
-use crate::simd::{ALIGNMENT, Simd, align, prefetch_part};
+use crate::conv::direct::MOST_CHANNELS;
+use crate::conv::weight_gradient::{TILE_TAPS, add_lanes, tile_height};
+use crate::simd::{ALIGNMENT, MOST_LANES, Simd, align, prefetch_part};
 
-/// Vectors of positions that all taps run over before the next: 8 channels of 32 vectors of 64 bytes are half of a 32 KiB cache.
+/// Vectors of positions that all taps run over before the next: 8 channels of 48 vectors of 64 bytes are 24 KiB.
 const CHUNK: usize = 48;
-/// Elements of the fewest positions of a strip, so that summing over lanes is a small part of the work.
+/// The fewest positions that a strip should have, so that summing over lanes is a small part of the work.
 const FEWEST_POSITIONS: usize = 768;
-/// The most lanes and channels a tile has on any instruction set.
-const MOST_LANES: usize = 16;
-const MOST_CHANNELS: usize = 8;
+/// With fewer than this, as where maps are few rows high, it is so large a part that the direct way is faster.
+const TOO_FEW_POSITIONS: usize = 512;
 
 /// The weight gradient of one shape.
 #[derive(Clone, Debug)]
@@ -30,15 +30,14 @@ pub(crate) struct WeightGradient {
 impl WeightGradient {
     /// The gradient of `shape`, if it gains.
     pub fn new(shape: ConvShape) -> Option<WeightGradient> {
-        let strips = |[rows, height, pitch, reach, planes]: [usize; 5]| {
-            Strips::new(rows, height, pitch, reach, |tile| {
-                (GRADIENT_BUDGET / ((rows + 2) * (planes + shape.oc) * tile)).max(FEWEST_POSITIONS.div_ceil(tile))
-            })
+        let most = |rows: usize, planes: usize, positions: usize| {
+            let tile = (rows + 2) * (planes + shape.oc) * positions;
+            (GRADIENT_BUDGET / tile).max(FEWEST_POSITIONS.div_ceil(positions))
         };
-        let (input, taps) = InputPoints::new(shape, strips)?;
-        // A strip is always this full but where images have few rows.
+        let (input, taps) = InputPoints::new(shape, most)?;
         let strips = &input.strips;
-        (strips.images * strips.per_strip * strips.pitch >= 512).then_some(WeightGradient { input, taps })
+        let positions = strips.images * strips.per_strip * strips.pitch;
+        (positions >= TOO_FEW_POSITIONS).then_some(WeightGradient { input, taps })
     }
 
     /// Elements of the planes of a point of the output's gradient.
@@ -140,10 +139,7 @@ impl WeightGradient {
         sums: &mut [f32],
         upcoming: &[f32],
     ) {
-        // The height that leaves the fewest rows empty: 24 or 18 accumulators, or 12 or 9 where there are 16 registers.
-        let heights = if S::MANY_REGISTERS { [8, 6] } else { [4, 3] };
-        let rows = |height: usize| self.input.shape.oc.div_ceil(height) * height;
-        match if rows(heights[0]) <= rows(heights[1]) { heights[0] } else { heights[1] } {
+        match tile_height(S::MANY_REGISTERS, self.input.shape.oc) {
             8 if S::MANY_REGISTERS => {
                 self.panels::<S, 8>(simd, strip, taps, points, gradient, dbias, sums, upcoming);
             }
@@ -169,8 +165,8 @@ impl WeightGradient {
     ) {
         let (oc, plane) = (self.input.shape.oc, self.input.strips.plane);
         let vectors = self.input.strips.used(strip).div_ceil(S::LANES);
-        assert!(MR <= MOST_CHANNELS && S::LANES <= MOST_LANES, "weight gradient: a tile is too large");
-        assert!(vectors * S::LANES + self.taps.farthest() <= input.len(), "weight gradient: too few points");
+        const { assert!(MR <= MOST_CHANNELS && S::LANES <= MOST_LANES) };
+        assert!(vectors * S::LANES + self.taps.farthest <= input.len(), "weight gradient: too few points");
         assert!(vectors * S::LANES <= plane && output.len() == oc * plane, "weight gradient: too few points");
         // A row of vectors, one for each tap, for each channel.
         let row = taps.next_multiple_of(TILE_TAPS);
