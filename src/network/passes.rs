@@ -180,5 +180,6 @@ impl<'a> Run<'a> {
             Kind::Layer | Kind::PooledConv(_) => barrier.backward_sums(moments, n, x, dy, sums, dparams),
             Kind::NormRectify(fused) => fused.backward_sums(self.params(index), moments, x, dy, sums, dparams),
         });
+        shard.add_group_sums(barrier.sums_len());
     }
 }
