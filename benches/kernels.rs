@@ -99,6 +99,16 @@ fn convolutions(criterion: &mut Criterion) {
         product(&mut group, "backward_input", operations, peak, || {
             conv.backward_input(IMAGES, black_box(&dy), &weight, &mut dx, &mut scratch);
         });
+        // As in a training step, where weights are packed once for all shards.
+        let (mut packed, mut packed_gradient) = (vec![0.0; conv.packed_len()], vec![0.0; conv.packed_gradient_len()]);
+        conv.pack(&weight, &bias, &mut packed);
+        conv.pack_gradient(&weight, &mut packed_gradient);
+        product(&mut group, "forward_packed", operations, peak, || {
+            conv.forward_packed(IMAGES, black_box(&x), &packed, &mut y, &mut scratch);
+        });
+        product(&mut group, "backward_input_packed", operations, peak, || {
+            conv.backward_input_packed(IMAGES, black_box(&dy), &packed_gradient, &mut dx, &mut scratch);
+        });
         product(&mut group, "backward_weight", operations, peak, || {
             conv.backward_weight(IMAGES, black_box(&x), &dy, &mut dweight, &mut dbias, &mut scratch);
         });
@@ -182,6 +192,7 @@ fn rectified(criterion: &mut Criterion) {
 /// A convolution behind a 4x4 pooling: the pooling with its places, and the gradients from those alone.
 fn pooled_convolutions(criterion: &mut Criterion) {
     let isa = Isa::best();
+    let peak = peak::measure_peak_gflops(isa, 0.5);
     for &(name, [c, h, w, oc, kernel, _]) in LAYERS.iter().filter(|(name, _)| name.starts_with("lenet")) {
         let [pad_top, pad_bottom, pad_left, pad_right] = [0; 4];
         let (kh, kw, stride_h, stride_w) = (kernel, kernel, 1, 1);
@@ -200,12 +211,13 @@ fn pooled_convolutions(criterion: &mut Criterion) {
         group.bench_function("max_forward_with_places", |b| {
             b.iter(|| pool::max_forward_with_places(isa, &pool_shape, IMAGES, w, black_box(&map), &mut y, &mut places));
         });
-        group.throughput(Throughput::Elements(2 * (pooled * c * kh * kw) as u64));
-        group.bench_function("sparse_backward_weight", |b| {
-            b.iter(|| conv.sparse_backward_weight(IMAGES, black_box(&x), &places, &dy, &mut dweight, &mut dbias));
+        // Of the positions that have a gradient: a 16th of all.
+        let operations = 2 * (pooled * c * kh * kw) as u64;
+        product(&mut group, "sparse_backward_weight", operations, peak, || {
+            conv.sparse_backward_weight(IMAGES, black_box(&x), &places, &dy, &mut dweight, &mut dbias);
         });
-        group.bench_function("sparse_backward_input", |b| {
-            b.iter(|| conv.sparse_backward_input(IMAGES, &places, black_box(&dy), &weight, &mut dx));
+        product(&mut group, "sparse_backward_input", operations, peak, || {
+            conv.sparse_backward_input(IMAGES, &places, black_box(&dy), &weight, &mut dx);
         });
         group.finish();
     }

@@ -123,14 +123,8 @@ impl Conv {
         if self.layout.copies { group_of(image, budget) * image + MOST_LANES } else { 0 }
     }
 
-    /// Checks the lengths that all passes share; `true` if there is anything to compute.
-    fn check(&self, pass: &str, n: usize, x_len: usize, y_len: usize, weight_len: usize, scratch_len: usize) -> bool {
-        let shape = &self.shape;
-        assert_eq!(x_len, n * shape.x_len(), "{pass}: length of the {n} inputs of {shape:?}");
-        assert_eq!(y_len, n * shape.y_len(), "{pass}: length of the {n} outputs of {shape:?}");
-        assert_eq!(weight_len, shape.oc * shape.taps(), "{pass}: length of the weights of {shape:?}");
-        assert!(scratch_len >= self.scratch_len(), "{pass}: scratch must have {} elements", self.scratch_len());
-        y_len > 0
+    fn check_scratch(&self, pass: &str, len: usize) {
+        assert!(len >= self.scratch_len(), "{pass}: scratch must have {} elements", self.scratch_len());
     }
 
     /// `y = conv(x, weight) + bias` for `n` images; `y` is overwritten.
@@ -142,7 +136,7 @@ impl Conv {
     /// # Panics
     /// If a slice has another length, or `scratch` less than [`Conv::scratch_len`].
     pub fn forward(&self, n: usize, x: &[f32], weight: &[f32], bias: &[f32], y: &mut [f32], scratch: &mut [f32]) {
-        assert!(scratch.len() >= self.scratch_len(), "conv forward: scratch must have {} elements", self.scratch_len());
+        self.check_scratch("conv forward", scratch.len());
         let (packed, scratch) = scratch.split_at_mut(self.packed_len());
         self.pack(weight, bias, packed);
         self.run_packed(n, x, packed, y, scratch);
@@ -170,7 +164,7 @@ impl Conv {
     /// # Panics
     /// As [`Conv::forward`].
     pub fn forward_packed(&self, n: usize, x: &[f32], packed: &[f32], y: &mut [f32], scratch: &mut [f32]) {
-        assert!(scratch.len() >= self.scratch_len(), "conv forward: scratch must have {} elements", self.scratch_len());
+        self.check_scratch("conv forward", scratch.len());
         assert_eq!(packed.len(), self.packed_len(), "conv forward: length of the packed weights of {:?}", self.shape);
         self.run_packed(n, x, packed, y, scratch);
     }
@@ -194,11 +188,7 @@ impl Conv {
     /// # Panics
     /// If a slice has another length, or `scratch` less than [`Conv::scratch_len`].
     pub fn backward_input(&self, n: usize, dy: &[f32], weight: &[f32], dx: &mut [f32], scratch: &mut [f32]) {
-        assert!(
-            scratch.len() >= self.scratch_len(),
-            "conv backward_input: scratch must have {} elements",
-            self.scratch_len()
-        );
+        self.check_scratch("conv backward_input", scratch.len());
         let (packed, scratch) = scratch.split_at_mut(self.packed_gradient_len());
         self.pack_gradient(weight, packed);
         self.run_packed_gradient(n, dy, packed, dx, scratch);
@@ -232,11 +222,7 @@ impl Conv {
     /// # Panics
     /// As [`Conv::backward_input`].
     pub fn backward_input_packed(&self, n: usize, dy: &[f32], packed: &[f32], dx: &mut [f32], scratch: &mut [f32]) {
-        assert!(
-            scratch.len() >= self.scratch_len(),
-            "conv backward_input: scratch must have {} elements",
-            self.scratch_len()
-        );
+        self.check_scratch("conv backward_input", scratch.len());
         assert_eq!(
             packed.len(),
             self.packed_gradient_len(),
@@ -275,10 +261,14 @@ impl Conv {
         dbias: &mut [f32],
         scratch: &mut [f32],
     ) {
-        let any = self.check("conv backward_weight", n, x.len(), dy.len(), dweight.len(), scratch.len());
-        assert_eq!(dbias.len(), self.shape.oc, "conv backward_weight: length of the bias of {:?}", self.shape);
+        let shape = &self.shape;
+        assert_eq!(x.len(), n * shape.x_len(), "conv backward_weight: length of the {n} inputs of {shape:?}");
+        assert_eq!(dy.len(), n * shape.y_len(), "conv backward_weight: length of the {n} outputs of {shape:?}");
+        assert_eq!(dweight.len(), shape.oc * shape.taps(), "conv backward_weight: length of the weights of {shape:?}");
+        assert_eq!(dbias.len(), shape.oc, "conv backward_weight: length of the bias of {shape:?}");
+        self.check_scratch("conv backward_weight", scratch.len());
         match &self.fast_weight_gradient {
-            _ if !any => {}
+            _ if dy.is_empty() => {}
             Some(fast) => fast_weight_gradient(self.isa, fast, x, dy, dweight, dbias, scratch),
             None => backward_weight(self.isa, self, x, dy, dweight, dbias, scratch),
         }
