@@ -173,10 +173,8 @@ impl Conv {
         let shape = &self.shape;
         assert_eq!(x.len(), n * shape.x_len(), "conv forward: length of the {n} inputs of {shape:?}");
         assert_eq!(y.len(), n * shape.y_len(), "conv forward: length of the {n} outputs of {shape:?}");
-        match &self.fast_forward {
-            _ if y.is_empty() => {}
-            Some(fast) => fast_forward(self.isa, fast, x, packed, y, scratch),
-            None => forward(self.isa, self, x, packed, y, scratch),
+        if !y.is_empty() {
+            forward(self.isa, self, x, packed, y, scratch);
         }
     }
 
@@ -267,10 +265,8 @@ impl Conv {
         assert_eq!(dweight.len(), shape.oc * shape.taps(), "conv backward_weight: length of the weights of {shape:?}");
         assert_eq!(dbias.len(), shape.oc, "conv backward_weight: length of the bias of {shape:?}");
         self.check_scratch("conv backward_weight", scratch.len());
-        match &self.fast_weight_gradient {
-            _ if dy.is_empty() => {}
-            Some(fast) => fast_weight_gradient(self.isa, fast, x, dy, dweight, dbias, scratch),
-            None => backward_weight(self.isa, self, x, dy, dweight, dbias, scratch),
+        if !dy.is_empty() {
+            backward_weight(self.isa, self, x, dy, dweight, dbias, scratch);
         }
     }
 }
@@ -340,19 +336,6 @@ per_isa! {
 }
 
 per_isa! {
-    fn fast_forward<S>(
-        simd: S,
-        forward: &winograd::Forward,
-        x: &[f32],
-        packed: &[f32],
-        y: &mut [f32],
-        scratch: &mut [f32],
-    ) {
-        forward.run(simd, x, packed, y, scratch);
-    }
-}
-
-per_isa! {
     fn fast_input_gradient<S>(
         simd: S,
         gradient: &winograd::InputGradient,
@@ -366,21 +349,10 @@ per_isa! {
 }
 
 per_isa! {
-    fn fast_weight_gradient<S>(
-        simd: S,
-        gradient: &winograd::WeightGradient,
-        x: &[f32],
-        dy: &[f32],
-        dweight: &mut [f32],
-        dbias: &mut [f32],
-        scratch: &mut [f32],
-    ) {
-        gradient.run(simd, x, dy, dweight, dbias, scratch);
-    }
-}
-
-per_isa! {
     fn forward<S>(simd: S, conv: &Conv, x: &[f32], packed: &[f32], y: &mut [f32], scratch: &mut [f32]) {
+        if let Some(fast) = &conv.fast_forward {
+            return fast.run(simd, x, packed, y, scratch);
+        }
         let copy = &mut scratch[..conv.copy_len(FORWARD_COPIES)];
         let sum = &conv.sum;
         if !conv.layout.copies {
@@ -407,6 +379,9 @@ per_isa! {
         dbias: &mut [f32],
         scratch: &mut [f32],
     ) {
+        if let Some(fast) = &conv.fast_weight_gradient {
+            return fast.run(simd, x, dy, dweight, dbias, scratch);
+        }
         let (copy, scratch) = scratch.split_at_mut(conv.copy_len(GRADIENT_COPIES));
         if !conv.layout.copies {
             return weight_gradient::run(simd, &conv.sum, x, dy, dweight, dbias, scratch);

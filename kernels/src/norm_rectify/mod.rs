@@ -13,7 +13,7 @@ mod forward;
 pub use backward::{backward, backward_sums};
 pub use forward::forward;
 
-use crate::simd::{ALIGNMENT, Simd, get_pairs};
+use crate::simd::{ALIGNMENT, Purpose, Simd, get_pairs};
 
 /// How the slopes of a row are found: none, one for all, or a list.
 const ZERO: u8 = 0;
@@ -29,7 +29,7 @@ const AHEAD: usize = 1024;
 #[inline(always)]
 fn prefetch_windows<S: Simd>(simd: S, x: *const f32, at: usize) {
     for line in (0..4 * S::LANES).step_by(ALIGNMENT) {
-        simd.prefetch_near(x.wrapping_add(AHEAD + 4 * at + line));
+        simd.prefetch(x.wrapping_add(AHEAD + 4 * at + line), Purpose::ReadSoon);
     }
 }
 

@@ -71,12 +71,23 @@ pub(crate) fn put_pairs<S: Simd>(simd: S, to: &mut [f32], at: usize, v: [S::V; 2
     unsafe { simd.store_pairs(to.as_mut_ptr(), v, to.len() / 2) };
 }
 
+/// What a cache line is fetched for.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Purpose {
+    /// To be read soon: into the first level.
+    ReadSoon,
+    /// To be read before long: into the second level.
+    ReadLater,
+    /// To be written to soon.
+    Write,
+}
+
 /// Has part `part` of `parts` of what is to be read before long fetched into the second-level cache.
 #[inline(always)]
 pub(crate) fn prefetch_part<S: Simd>(simd: S, upcoming: &[f32], part: usize, parts: usize) {
     let lines = upcoming.len() / ALIGNMENT;
     for line in lines * part / parts..lines * (part + 1) / parts {
-        simd.prefetch_to_read(upcoming[line * ALIGNMENT..].as_ptr());
+        simd.prefetch(upcoming[line * ALIGNMENT..].as_ptr(), Purpose::ReadLater);
     }
 }
 
@@ -124,20 +135,10 @@ pub(crate) trait Simd: Copy {
         sums
     }
 
-    /// Has the cache line of an address fetched that is to be written to soon; any address will do.
+    /// Has the cache line of an address fetched; any address will do.
     #[inline(always)]
-    fn prefetch_to_write(self, p: *const f32) {
-        let _ = p;
-    }
-    /// Has the cache line of an address fetched into the second level, as it is to be read before long; any address will do.
-    #[inline(always)]
-    fn prefetch_to_read(self, p: *const f32) {
-        let _ = p;
-    }
-    /// Has the cache line of an address fetched into the first level, as it is to be read soon; any address will do.
-    #[inline(always)]
-    fn prefetch_near(self, p: *const f32) {
-        let _ = p;
+    fn prefetch(self, p: *const f32, purpose: Purpose) {
+        let _ = (p, purpose);
     }
 
     /// Reads `LANES` values.
@@ -155,16 +156,7 @@ pub(crate) trait Simd: Copy {
     ///
     /// # Safety
     /// `p` must be valid for reading `2 count` values.
-    #[inline(always)]
-    unsafe fn load_pairs(self, p: *const f32, count: usize) -> [Self::V; 2] {
-        let mut lanes = [[0.0; 16]; 2];
-        for i in 0..2 * count.min(Self::LANES) {
-            // SAFETY: the caller vouches for `2 count` values.
-            lanes[i % 2][(i / 2) & 15] = unsafe { *p.add(i) };
-        }
-        // SAFETY: each row of `lanes` holds 16 values, and no vector is longer.
-        unsafe { [self.load(lanes[0].as_ptr()), self.load(lanes[1].as_ptr())] }
-    }
+    unsafe fn load_pairs(self, p: *const f32, count: usize) -> [Self::V; 2];
     /// Brings one value for each pair, lane by lane, in the order of [`Simd::load_pairs`].
     #[inline(always)]
     fn to_pair_order(self, v: Self::V) -> Self::V {
@@ -179,18 +171,7 @@ pub(crate) trait Simd: Copy {
     ///
     /// # Safety
     /// `p` must be valid for writing `2 count` values.
-    #[inline(always)]
-    unsafe fn store_pairs(self, p: *mut f32, v: [Self::V; 2], count: usize) {
-        let mut lanes = [[0.0; 16]; 2];
-        // SAFETY: each row of `lanes` holds 16 values; the caller vouches for the places.
-        unsafe {
-            self.store(lanes[0].as_mut_ptr(), v[0]);
-            self.store(lanes[1].as_mut_ptr(), v[1]);
-            for i in 0..2 * count.min(Self::LANES) {
-                *p.add(i) = lanes[i % 2][(i / 2) & 15];
-            }
-        }
-    }
+    unsafe fn store_pairs(self, p: *mut f32, v: [Self::V; 2], count: usize);
     /// Writes `LANES` values.
     ///
     /// # Safety

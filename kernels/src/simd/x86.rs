@@ -3,8 +3,22 @@
 //! The tokens' constructors need the instruction set themselves, so whoever holds a token may run its instructions;
 //! that is what every SAFETY line here without a pointer in it refers to.
 
-use super::Simd;
+use super::{Purpose, Simd};
 use std::arch::x86_64::*;
+
+/// Has a cache line fetched.
+#[inline(always)]
+fn prefetch(p: *const f32, purpose: Purpose) {
+    // SAFETY: the instructions read and write nothing, whatever the address; those of the first and second level belong to
+    // x86-64, and every processor with AVX2 has that for writing.
+    unsafe {
+        match purpose {
+            Purpose::ReadSoon => _mm_prefetch::<_MM_HINT_T0>(p.cast()),
+            Purpose::ReadLater => _mm_prefetch::<_MM_HINT_T1>(p.cast()),
+            Purpose::Write => _mm_prefetch::<_MM_HINT_ET0>(p.cast()),
+        }
+    }
+}
 
 /// The token of AVX2 and FMA.
 #[derive(Clone, Copy)]
@@ -33,21 +47,8 @@ impl Simd for Avx2 {
     const MANY_REGISTERS: bool = false;
 
     #[inline(always)]
-    fn prefetch_to_write(self, p: *const f32) {
-        // SAFETY: the token proves x86-64 with AVX2, which has the instruction; it reads and writes nothing.
-        unsafe { _mm_prefetch::<_MM_HINT_ET0>(p.cast()) }
-    }
-
-    #[inline(always)]
-    fn prefetch_to_read(self, p: *const f32) {
-        // SAFETY: the token proves x86-64; the instruction reads and writes nothing.
-        unsafe { _mm_prefetch::<_MM_HINT_T1>(p.cast()) }
-    }
-
-    #[inline(always)]
-    fn prefetch_near(self, p: *const f32) {
-        // SAFETY: the token proves x86-64; the instruction reads and writes nothing.
-        unsafe { _mm_prefetch::<_MM_HINT_T0>(p.cast()) }
+    fn prefetch(self, p: *const f32, purpose: Purpose) {
+        prefetch(p, purpose);
     }
 
     #[inline(always)]
@@ -332,21 +333,8 @@ impl Simd for Avx512 {
     const MANY_REGISTERS: bool = true;
 
     #[inline(always)]
-    fn prefetch_to_write(self, p: *const f32) {
-        // SAFETY: the token proves x86-64 with AVX2, which has the instruction; it reads and writes nothing.
-        unsafe { _mm_prefetch::<_MM_HINT_ET0>(p.cast()) }
-    }
-
-    #[inline(always)]
-    fn prefetch_to_read(self, p: *const f32) {
-        // SAFETY: the token proves x86-64; the instruction reads and writes nothing.
-        unsafe { _mm_prefetch::<_MM_HINT_T1>(p.cast()) }
-    }
-
-    #[inline(always)]
-    fn prefetch_near(self, p: *const f32) {
-        // SAFETY: the token proves x86-64; the instruction reads and writes nothing.
-        unsafe { _mm_prefetch::<_MM_HINT_T0>(p.cast()) }
+    fn prefetch(self, p: *const f32, purpose: Purpose) {
+        prefetch(p, purpose);
     }
 
     #[inline(always)]

@@ -11,7 +11,7 @@ use super::input_points::Taps;
 use super::strips::{Strip, Strips};
 use super::transform::{self, MOST_POINTS, POINT_ONE};
 use crate::conv::direct::{MOST_CHANNELS, tile, tile_height};
-use crate::simd::{MOST_LANES, Simd, prefetch_part};
+use crate::simd::{MOST_LANES, Purpose, Simd, prefetch_part};
 
 /// Where the positions of the tiles lie in the output.
 #[derive(Clone, Debug)]
@@ -250,9 +250,9 @@ impl PointSum {
         let at = segment.out + channel * self.target.map;
         for row in 0..segment.rows.1 - segment.rows.0 {
             let at = at + row * self.target.row_step;
-            simd.prefetch_to_write(out.as_ptr().wrapping_add(at));
+            simd.prefetch(out.as_ptr().wrapping_add(at), Purpose::Write);
             if self.target.column_step > 1 {
-                simd.prefetch_to_write(out.as_ptr().wrapping_add(at + S::LANES));
+                simd.prefetch(out.as_ptr().wrapping_add(at + S::LANES), Purpose::Write);
             }
         }
     }
