@@ -2,9 +2,9 @@
 //! thread, as in a training step.
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
-use steersman::layers::gradcheck::Harness;
-use steersman::network::LayerSpec;
-use steersman::tensor::Shape;
+use steersman::engine::layers::gradcheck::Harness;
+use steersman::engine::network::LayerSpec;
+use steersman::engine::tensor::Shape;
 use steersman_kernels::Isa;
 
 const IMAGES: usize = 8;

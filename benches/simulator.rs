@@ -6,10 +6,11 @@ use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_m
 use steersman::model_file::{Model, TrainingRecord};
 use steersman::pilot::Pilot;
 use steersman::recipe::Recipe;
-use steersman::simulator::run::run;
+use steersman::simulator::camera::jpeg;
+use steersman::simulator::trial::run::run;
 use steersman::simulator::{
     Camera, DriveState, Driver, Expert, HEIGHT, Mount, Renderer, RgbFrame, RunOptions, Simulation, Speed, Start, Track,
-    Variant, WIDTH, jpeg,
+    Variant, WIDTH,
 };
 use steersman_kernels::Isa;
 

@@ -1,9 +1,9 @@
 //! A whole training step of each shipped network on random images: forward, backward, update. All cores.
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
-use steersman::network::{StepInput, TrainingPlan};
-use steersman::optimizer::Optimizer;
-use steersman::random::{Purpose, rng, uniform};
+use steersman::engine::network::{StepInput, TrainingPlan};
+use steersman::engine::optimizer::Optimizer;
+use steersman::engine::random::{Purpose, rng, uniform};
 use steersman::recipe::Recipe;
 use steersman_kernels::Isa;
 

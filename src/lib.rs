@@ -4,18 +4,18 @@
 //! # A tour
 //!
 //! A frame's way to the wheels: [`dataset`] reads a recording, splits it *before* anything is augmented, decodes each image
-//! once and preprocesses it; a [`recipe`] says how, and what network to train; [`network`] plans the buffers of its
-//! [`layers`] and runs them; [`training`] goes through the epochs, follows the gradient with an [`optimizer`] and writes the
+//! once and preprocesses it; a [`recipe`] says how, and what network to train; [`network`](engine::network) plans the buffers of its
+//! [`layers`](engine::layers) and runs them; [`training`] goes through the epochs, follows the gradient with an [`optimizer`](engine::optimizer) and writes the
 //! run folder; [`model_file`] is what remains; a [`pilot`] loads it and steers. [`report`] measures how well it predicts,
 //! and [`simulator`] how well it drives; [`live`] shows a drive in a browser, and lets a person drive there; [`exchange`] reads
 //! models of other programs and writes ours down for them. [`cli`] is the command line.
 //!
-//! Dependencies point one way: `steersman-kernels` (all vector code and every `unsafe` line) ← [`tensor`] ← [`layers`] ←
-//! [`network`] (with the [`loss`]) ← [`optimizer`] ← [`training`]; [`dataset`] and [`simulator`] know no network.
+//! Dependencies point one way: `steersman-kernels` (all vector code and every `unsafe` line) ← [`tensor`](engine::tensor) ← [`layers`](engine::layers) ←
+//! [`network`](engine::network) (with the [`loss`](engine::loss)) ← [`optimizer`](engine::optimizer) ← [`training`]; [`dataset`] and [`simulator`] know no network.
 //!
 //! # Three promises
 //!
-//! - **The same bits.** Every random choice is keyed by seed, purpose, epoch and sample ([`random`]), and sums are added in
+//! - **The same bits.** Every random choice is keyed by seed, purpose, epoch and sample ([`random`](engine::random)), and sums are added in
 //!   an order that does not depend on the number of threads. On one level of vector code, a seed gives the same weights on
 //!   any number of threads, with or without a cache, stopped and resumed or not.
 //! - **No allocation** in a training step or a prediction once the buffers are planned.
@@ -76,10 +76,10 @@
 //! # Train on numbers of your own
 //!
 //! ```
-//! use steersman::network::{LayerSpec, Network, StepInput, TrainingPlan};
-//! use steersman::optimizer::{Optimizer, OptimizerSpec};
-//! use steersman::tensor::{Initializer, Shape};
-//! use steersman::loss::Loss;
+//! use steersman::engine::network::{LayerSpec, Network, StepInput, TrainingPlan};
+//! use steersman::engine::optimizer::{Optimizer, OptimizerSpec};
+//! use steersman::engine::tensor::{Initializer, Shape};
+//! use steersman::engine::loss::Loss;
 //! use steersman_kernels::Isa;
 //!
 //! // y = x1 − x2, learned by one dense layer.
@@ -104,14 +104,14 @@
 //!
 //! # Add a layer
 //!
-//! A layer is its forward pass and its hand-written backward pass; [`gradcheck`](layers::gradcheck) compares the two by finite
+//! A layer is its forward pass and its hand-written backward pass; [`gradcheck`](engine::layers::gradcheck) compares the two by finite
 //! differences, and panics with the name of the tensor if they disagree. What else makes it a layer that recipes can name
-//! stands in [`layers`]; how to add a recipe, in [`recipe`].
+//! stands in [`layers`](engine::layers); how to add a recipe, in [`recipe`].
 //!
 //! ```
-//! use steersman::layers::gradcheck::check_layer;
-//! use steersman::layers::{Grads, Layer, Pair, Pass};
-//! use steersman::tensor::Shape;
+//! use steersman::engine::layers::gradcheck::check_layer;
+//! use steersman::engine::layers::{Grads, Layer, Pair, Pass};
+//! use steersman::engine::tensor::Shape;
 //!
 //! /// Softplus: `y = ln(1 + eˣ)`, `dx = dy / (1 + e⁻ˣ)`.
 //! #[derive(Debug)]
@@ -150,28 +150,21 @@
 //! ```
 #![forbid(unsafe_code)]
 
-pub mod atomic_file;
 pub mod cli;
 pub mod dataset;
+pub mod engine;
 pub mod error;
 pub mod exchange;
-mod http;
-pub mod layers;
+pub mod files;
 pub mod live;
-pub mod loss;
 pub mod main_job;
 pub mod model_file;
-pub mod network;
-pub mod new_folder;
-pub mod optimizer;
+mod net;
 pub mod pilot;
-pub mod random;
 pub mod recipe;
 pub mod report;
 pub mod serve;
 pub mod simulator;
-pub mod stopwatch;
-pub mod tensor;
 pub mod training;
 
 pub use error::{Error, Result};

@@ -12,9 +12,9 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use steersman_kernels::Isa;
 
-use crate::atomic_file;
+use crate::engine::network::{Network, Parameters};
 use crate::error::{Error, Result};
-use crate::network::{Network, Parameters};
+use crate::files::atomic_file;
 use crate::recipe::Recipe;
 
 const FORMAT: u32 = 1;
@@ -187,7 +187,7 @@ fn f32_bytes(values: &[f32]) -> Vec<u8> {
 
 /// All tensors of a network, in its order.
 pub(crate) fn tensors_of(network: &Network, parameters: &Parameters) -> Vec<StoredTensor> {
-    let stored = |tensor: &crate::network::Tensor| StoredTensor {
+    let stored = |tensor: &crate::engine::network::Tensor| StoredTensor {
         name: tensor.name.clone(),
         dtype: Dtype::F32,
         shape: tensor.spec.shape.clone(),

@@ -16,11 +16,11 @@ use crate::dataset::augment::Augmentation;
 use crate::dataset::preprocess::Preprocessing;
 use crate::dataset::split::SplitSpec;
 use crate::dataset::{Balance, SampleSpec};
+use crate::engine::loss::Loss;
+use crate::engine::network::{LayerSpec, Network};
+use crate::engine::optimizer::{OptimizerSpec, Schedule, ScheduleSpec};
+use crate::engine::tensor::Shape;
 use crate::error::{Error, Result};
-use crate::loss::Loss;
-use crate::network::{LayerSpec, Network};
-use crate::optimizer::{OptimizerSpec, Schedule, ScheduleSpec};
-use crate::tensor::Shape;
 
 /// Name and text of each recipe that is built in.
 pub const SHIPPED: [(&str, &str); 5] = [

@@ -13,7 +13,8 @@ use steersman::main_job::training_set::{Take, recordings};
 use steersman::main_job::{TrackResult, test_on_track};
 use steersman::pilot::Pilot;
 use steersman::recipe::Recipe;
-use steersman::simulator::{DriveOptions, Driver, Track, Zero, drive};
+use steersman::simulator::trial::drive;
+use steersman::simulator::{DriveOptions, Driver, Track, Zero};
 use steersman::training::{EpochRecord, Observer, TrainRequest, TrainResult, train};
 
 struct Silent;

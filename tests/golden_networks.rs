@@ -5,11 +5,11 @@ mod common;
 
 use common::formula::{hash, unit};
 use serde::Deserialize;
-use steersman::layers::gradcheck::relative_error;
-use steersman::layers::{Grads, Pair, Pass};
-use steersman::loss::Loss;
-use steersman::network::{LayerSpec, Network, Parameters, StepInput, TrainingPlan};
-use steersman::optimizer::{Optimizer, OptimizerSpec};
+use steersman::engine::layers::gradcheck::relative_error;
+use steersman::engine::layers::{Grads, Pair, Pass};
+use steersman::engine::loss::Loss;
+use steersman::engine::network::{LayerSpec, Network, Parameters, StepInput, TrainingPlan};
+use steersman::engine::optimizer::{Optimizer, OptimizerSpec};
 use steersman::recipe::Recipe;
 use steersman_kernels::Isa;
 
@@ -179,7 +179,7 @@ fn check(name: &str, isa: Isa) {
     let mut failures = Vec::new();
 
     let start = parameters(&network);
-    let mut inference = steersman::network::InferencePlan::new(&network, golden.batch);
+    let mut inference = steersman::engine::network::InferencePlan::new(&network, golden.batch);
     let mut predictions = vec![f32::NAN; golden.batch];
     inference.run(&network, &start, &x, &mut predictions);
     let last = &network.layers().last().unwrap().name;

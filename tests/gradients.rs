@@ -4,11 +4,11 @@
 //! is measured against the norm of the tensor's gradient, which is what a random direction of signs sees of it on average.
 
 use rand::Rng;
-use steersman::loss::Loss;
-use steersman::network::{Network, Parameters, StepInput, Tensor, TrainingPlan};
-use steersman::random::{Purpose, rng, uniform, unit};
+use steersman::engine::loss::Loss;
+use steersman::engine::network::{Network, Parameters, StepInput, Tensor, TrainingPlan};
+use steersman::engine::random::{Purpose, rng, uniform, unit};
+use steersman::engine::tensor::Shape;
 use steersman::recipe::Recipe;
-use steersman::tensor::Shape;
 use steersman_kernels::Isa;
 
 const IMAGES: usize = 6;

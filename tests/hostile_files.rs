@@ -13,11 +13,11 @@ use std::time::{Duration, Instant};
 use cap::Cap;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use steersman::engine::tensor::Shape;
 use steersman::exchange::keras::{ImportOptions, import};
 use steersman::exchange::presets;
 use steersman::model_file::{Model, TrainingRecord};
 use steersman::recipe::Recipe;
-use steersman::tensor::Shape;
 use steersman_kernels::Isa;
 
 /// Counts every allocation, and ends the process at the limit.

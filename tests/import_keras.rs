@@ -10,9 +10,9 @@ use common::formula::{hash, unit};
 use common::painted_log;
 use ndarray::{Array4, ArrayView4};
 use serde_json::Value;
+use steersman::engine::network::Network;
+use steersman::engine::tensor::Shape;
 use steersman::exchange::keras::{ImportOptions, import};
-use steersman::network::Network;
-use steersman::tensor::Shape;
 use steersman_kernels::Isa;
 
 fn golden(name: &str) -> PathBuf {

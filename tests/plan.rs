@@ -3,12 +3,12 @@
 
 use std::sync::{Mutex, PoisonError};
 
-use steersman::loss::Loss;
-use steersman::network::{InferencePlan, LayerSpec, Network, Parameters, StepInput, TrainingPlan};
-use steersman::optimizer::Optimizer;
-use steersman::random::{Purpose, rng, uniform};
+use steersman::engine::loss::Loss;
+use steersman::engine::network::{InferencePlan, LayerSpec, Network, Parameters, StepInput, TrainingPlan};
+use steersman::engine::optimizer::Optimizer;
+use steersman::engine::random::{Purpose, rng, uniform};
+use steersman::engine::tensor::Shape;
 use steersman::recipe::Recipe;
-use steersman::tensor::Shape;
 use steersman_kernels::Isa;
 
 #[global_allocator]
@@ -150,7 +150,7 @@ fn a_network_can_learn_eight_images_by_heart() {
             .recipe
             .layers
             .iter()
-            .filter(|layer| !matches!(layer, steersman::network::LayerSpec::Dropout { .. }))
+            .filter(|layer| !matches!(layer, steersman::engine::network::LayerSpec::Dropout { .. }))
             .cloned()
             .collect();
         let network = Network::new(setup.network.input(), &layers, Isa::best()).unwrap();

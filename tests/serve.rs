@@ -14,7 +14,7 @@ use serde_json::Value;
 use steersman::pilot::Pilot;
 use steersman::serve::client::{ClientOptions, ClientReport, Numbers, Observer, Pace, drive};
 use steersman::serve::protocol::DecimalMark;
-use steersman::simulator::run::run;
+use steersman::simulator::trial::run::run;
 use steersman::simulator::{RunOptions, Speed, Track};
 
 /// Long enough for an answer that must not come. (Where the machine stands still, a wrong answer could be missed, not invented.)

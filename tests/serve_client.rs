@@ -12,8 +12,8 @@ use steersman::Error;
 use steersman::dataset::decode::{RgbImage, decode_rgb};
 use steersman::serve::client::{ClientOptions, ClientReport, Numbers, Observer, Pace, drive};
 use steersman::serve::protocol::DecimalMark;
-use steersman::simulator::run::run;
-use steersman::simulator::speed::SpeedController;
+use steersman::simulator::car::speed::SpeedController;
+use steersman::simulator::trial::run::run;
 use steersman::simulator::{DriveState, Driver, RgbFrame, RunOptions, Speed, Track};
 
 struct Silent;

@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 
 use common::served::{Served, command, random_model, sample_jpeg, telemetry};
 use rand::Rng;
-use steersman::random::{Purpose, below, rng};
+use steersman::engine::random::{Purpose, below, rng};
 
 /// The request of Udacity's simulator.
 const REQUEST: &[u8] = b"GET /socket.io/?EIO=4&transport=websocket HTTP/1.1\r\nUser-Agent: websocket-sharp/1.0\r\n\

@@ -9,12 +9,12 @@ use steersman_kernels::Isa;
 use steersman_kernels::peak::measure_peak_gflops;
 
 use super::{RecipeArgs, pool, print_json};
+use crate::engine::network::{InferencePlan, Network, Parameters, StageTime, StepInput, TrainingPlan};
+use crate::engine::optimizer::Optimizer;
+use crate::engine::random::{Purpose, rng, uniform};
+use crate::engine::stopwatch::Stopwatch;
 use crate::error::{Error, Result};
-use crate::network::{InferencePlan, Network, Parameters, StageTime, StepInput, TrainingPlan};
-use crate::optimizer::Optimizer;
-use crate::random::{Purpose, rng, uniform};
 use crate::recipe::Recipe;
-use crate::stopwatch::Stopwatch;
 
 /// Largest batch: beyond it, eight of them do not fit into memory.
 const MAX_BATCH: usize = 16_384;

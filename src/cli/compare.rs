@@ -5,8 +5,8 @@ use std::path::PathBuf;
 use clap::Args;
 
 use super::refuse_existing;
-use crate::atomic_file;
 use crate::error::Result;
+use crate::files::atomic_file;
 use crate::report::comparison;
 
 /// Lay runs side by side on one page: curves, figures, recipes, drives

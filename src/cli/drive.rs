@@ -11,18 +11,19 @@ use super::video::tell_video;
 use super::{pool, print, print_json, stop_on_ctrl_c};
 use crate::dataset::held_out::trained_on_held_out;
 use crate::error::{Error, Result};
+use crate::files::new_folder::NewFolder;
 use crate::live::messages::Hello;
 use crate::live::{DEFAULT_PORT, Live, Watch};
-use crate::new_folder::NewFolder;
 use crate::pilot::Pilot;
 use crate::report::map;
 use crate::report::video::Onlooker;
 use crate::report::video::drive::DriveVideo;
 use crate::report::video::panel::Names;
-use crate::simulator::drive::write_trajectories;
-use crate::simulator::statistics::PairedTest;
+use crate::simulator::trial::drive::drive;
+use crate::simulator::trial::drive::write_trajectories;
+use crate::simulator::trial::statistics::PairedTest;
 use crate::simulator::{
-    DriveOptions, DriveResult, DriveSummary, Driver, Expert, Speed, Track, Zero, compare, drive, drive_observed,
+    DriveOptions, DriveResult, DriveSummary, Driver, Expert, Speed, Track, Zero, compare, drive_observed,
 };
 
 /// Let a model drive in the simulator and measure how well

@@ -8,8 +8,8 @@ use serde::Serialize;
 
 use super::share_bar::ShareBar;
 use super::{new_folder, pool, print, print_json, refuse_existing, stop_on_ctrl_c};
-use crate::atomic_file;
 use crate::error::{Error, Result};
+use crate::files::atomic_file;
 use crate::pilot::Pilot;
 use crate::report::counterfactual::{Counterfactuals, examine};
 use crate::report::explanation::{self, Exhibit};

@@ -6,10 +6,10 @@ use clap::{Args, ValueEnum};
 use serde::Serialize;
 
 use super::{print, print_json};
-use crate::atomic_file;
 use crate::error::{Error, Result};
 use crate::exchange::onnx::{OPSET, OnnxOptions, onnx};
 use crate::exchange::source::{Language, source};
+use crate::files::atomic_file;
 use crate::model_file::Model;
 
 /// Write a model as an ONNX file, or as C or Rust source code that needs nothing else

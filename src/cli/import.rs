@@ -12,13 +12,13 @@ use crate::dataset;
 use crate::dataset::colour::Colour;
 use crate::dataset::preprocess::Preprocessing;
 use crate::dataset::resize::Interpolation;
+use crate::engine::network::Network;
+use crate::engine::tensor::Shape;
 use crate::error::{Error, Result};
 use crate::exchange::fit::{self, Candidate, Frames};
 use crate::exchange::keras::{self, ImportOptions, LayerReport};
 use crate::exchange::presets;
 use crate::model_file::weights_hash;
-use crate::network::Network;
-use crate::tensor::Shape;
 
 /// Import a Keras model: HDF5 of Keras 1 and 2, or the .keras file of Keras 3
 #[derive(Debug, Args)]

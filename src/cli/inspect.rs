@@ -6,9 +6,9 @@ use clap::Args;
 
 use super::share_bar::ShareBar;
 use super::{RecipeArgs, new_folder, pool, print, print_json, refuse_existing};
-use crate::atomic_file;
 use crate::dataset::inspect::inspect;
 use crate::error::Result;
+use crate::files::atomic_file;
 use crate::report::inspection;
 
 /// Say what is in a recording: rows, sessions, labels, pictures, what cannot be used, and what to do about it

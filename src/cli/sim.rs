@@ -9,15 +9,15 @@ use serde::Serialize;
 
 use super::share_bar::ShareBar;
 use super::{or_dash, print_json, stop_on_ctrl_c};
-use crate::atomic_file;
 use crate::error::{Error, Result};
-use crate::new_folder::create_now;
+use crate::files::atomic_file;
+use crate::files::new_folder::create_now;
 use crate::serve::client::{ClientOptions, ClientReport, Numbers, Observer, Pace, ServerUrl, drive};
 use crate::serve::protocol::DecimalMark;
 use crate::simulator::Track;
-use crate::simulator::run::{Failure, line_errors_m};
-use crate::simulator::statistics::quantile;
-use crate::simulator::trajectory::trajectory_csv;
+use crate::simulator::trial::run::{Failure, line_errors_m};
+use crate::simulator::trial::statistics::quantile;
+use crate::simulator::trial::trajectory::trajectory_csv;
 
 /// Put the built-in simulator in the place of Udacity's: it connects to a driving server, as `serve` is one
 #[derive(Debug, Args)]

@@ -7,10 +7,10 @@ use serde::Serialize;
 use steersman_kernels::Isa;
 
 use super::{RecipeArgs, print, print_json, refuse_existing};
-use crate::atomic_file;
+use crate::engine::network::{NamedLayer, Network};
 use crate::error::Result;
+use crate::files::atomic_file;
 use crate::model_file::Model;
-use crate::network::{NamedLayer, Network};
 use crate::recipe::Recipe;
 use crate::report::network_diagram;
 

@@ -13,8 +13,10 @@ use super::{print, print_json};
 use crate::dataset::decode::{self, decode_rgb};
 use crate::dataset::{self, Camera};
 use crate::error::{Error, Result};
-use crate::new_folder::NewFolder;
-use crate::simulator::{Track, builtin, contact_sheet, side_by_side};
+use crate::files::new_folder::NewFolder;
+use crate::simulator::camera::contact_sheet::contact_sheet;
+use crate::simulator::road::builtin;
+use crate::simulator::{Track, side_by_side};
 
 /// Centre pictures on a sheet: columns and rows.
 const SHEET: (usize, usize) = (4, 7);

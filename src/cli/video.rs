@@ -12,7 +12,7 @@ use crate::error::{Error, Result};
 use crate::pilot::Pilot;
 use crate::report::video::replay::{self, Choice};
 use crate::report::video::{Onlooker, VideoSummary, recording};
-use crate::simulator::trajectory::{RUN_DEPTH, find_drives, is_drive};
+use crate::simulator::trial::trajectory::{RUN_DEPTH, find_drives, is_drive};
 
 /// Write a recording or a saved drive as a video that browsers and VLC play
 #[derive(Debug, Args)]

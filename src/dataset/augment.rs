@@ -5,7 +5,7 @@
 //! lines, colours, brightness. Each is drawn anew for every sample and epoch.
 
 use super::preprocess::Preprocessing;
-use crate::random::{below, uniform, unit};
+use crate::engine::random::{below, uniform, unit};
 use crate::{Error, Result};
 use rand::Rng;
 use serde::{Deserialize, Serialize};
@@ -280,7 +280,7 @@ fn recolour(rgb: &mut [u8], turn: f64, saturation: f64, tint: [f64; 3], contrast
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::random::{Purpose, rng};
+    use crate::engine::random::{Purpose, rng};
 
     fn preprocessing() -> Preprocessing {
         Preprocessing { source: [8, 20], rows: [0, 8], resize: [4, 10], ..Default::default() }

@@ -1,7 +1,7 @@
 //! Which images of a row are used, and which rows: the `[samples]`, `[balance]` and `[split]` tables of a recipe.
 
 use super::recording::{Camera, Recording};
-use crate::random::{Purpose, rng, shuffle};
+use crate::engine::random::{Purpose, rng, shuffle};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 

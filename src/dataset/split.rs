@@ -6,7 +6,7 @@
 
 use super::recording::{Camera, Recording};
 use super::samples::{Balance, Item, SampleSpec};
-use crate::random::{Purpose, rng, shuffle, unit};
+use crate::engine::random::{Purpose, rng, shuffle, unit};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 use std::ops::Range;

@@ -1,8 +1,8 @@
 //! A network without its training: a chain of operations with their numbers.
 
+use crate::engine::network::{LayerSpec, NamedLayer, Network, Parameters};
+use crate::engine::tensor::Shape;
 use crate::error::{Error, Result};
-use crate::network::{LayerSpec, NamedLayer, Network, Parameters};
-use crate::tensor::Shape;
 
 /// One operation of the chain.
 #[derive(Clone, Debug, PartialEq)]
@@ -14,7 +14,7 @@ pub(crate) struct Step {
     pub op: Op,
 }
 
-/// What a step computes. The formulas are those of the layers in [`layers`](crate::layers).
+/// What a step computes. The formulas are those of the layers in [`layers`](crate::engine::layers).
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) enum Op {
     /// `weight` is `[filters][channels][kernel height][kernel width]`.

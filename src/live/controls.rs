@@ -3,9 +3,9 @@
 use std::time::{Duration, Instant};
 
 use super::messages::{Input, Request};
-use crate::simulator::car::Controls;
-use crate::simulator::keys;
-use crate::simulator::speed::SpeedController;
+use crate::simulator::car::dynamics::Controls;
+use crate::simulator::car::keys;
+use crate::simulator::car::speed::SpeedController;
 
 /// Who says nothing for so long has let go. (A page that is hidden says that it leaves; a browser that ends closes its
 /// connection. This is for one that hangs.)
@@ -140,7 +140,7 @@ impl Cockpit {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::simulator::car::{Car, MPS_PER_MPH, STEP_S};
+    use crate::simulator::car::dynamics::{Car, MPS_PER_MPH, STEP_S};
 
     fn pressed(steer: f64, pedal: f64) -> Input {
         Input { steer, pedal, ..Input::default() }

@@ -14,11 +14,11 @@ use super::coverage::{Coverage, Row, Shares};
 use super::messages::{Hello, Manual, State};
 use super::server::Live;
 use crate::error::{Error, Result};
-use crate::new_folder::NewFolder;
-use crate::simulator::car::{Controls, MPS_PER_MPH, STEP_S, STEPS_PER_S};
-use crate::simulator::eye::Eye;
-use crate::simulator::recorder::{RecordingInfo, Sample};
-use crate::simulator::writer::RowWriter;
+use crate::files::new_folder::NewFolder;
+use crate::simulator::camera::eye::Eye;
+use crate::simulator::car::dynamics::{Controls, MPS_PER_MPH, STEP_S, STEPS_PER_S};
+use crate::simulator::recorder::record::{RecordingInfo, Sample};
+use crate::simulator::recorder::writer::RowWriter;
 use crate::simulator::{RecordOptions, Simulation, Start, Track};
 
 /// What is said where the program itself is at fault.

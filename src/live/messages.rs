@@ -8,9 +8,9 @@ use serde::{Deserialize, Serialize};
 use super::coverage::Shares;
 use crate::report::map;
 use crate::report::palette::heat_hex;
-use crate::simulator::car::MAX_STEER_DEG;
-use crate::simulator::expert::pursuit;
-use crate::simulator::speed::telemetry_mph;
+use crate::simulator::car::dynamics::MAX_STEER_DEG;
+use crate::simulator::car::expert::pursuit;
+use crate::simulator::car::speed::telemetry_mph;
 use crate::simulator::{Simulation, Track};
 
 /// What the page asks for.

@@ -15,7 +15,7 @@ use super::controls::Wheel;
 use super::hub::Hub;
 use super::messages::{Farewell, Hello, Request, State};
 use crate::error::{Error, Result};
-use crate::http::{self, BadHead, Head};
+use crate::net::http::{self, BadHead, Head};
 use crate::serve::socket::{Socket, is_timeout};
 
 /// Port of the page, unless told otherwise.

@@ -10,7 +10,8 @@ use crate::dataset::decode::RgbImage;
 use crate::error::{Error, Result};
 use crate::pilot::Pilot;
 use crate::report::saliency::Saliency;
-use crate::simulator::{DriveFrame, DriveObserver, HEIGHT, RunOptions, WIDTH, jpeg};
+use crate::simulator::camera::jpeg;
+use crate::simulator::{DriveFrame, DriveObserver, HEIGHT, RunOptions, WIDTH};
 
 /// How soon a wait notices that it is to end.
 const TICK: Duration = Duration::from_millis(50);

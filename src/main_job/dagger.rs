@@ -4,9 +4,9 @@ use std::path::{Path, PathBuf};
 
 use super::training_set::{Take, record_takes};
 use crate::error::Result;
-use crate::new_folder::NewFolder;
+use crate::files::new_folder::NewFolder;
 use crate::pilot::Pilot;
-use crate::simulator::recorder::{drive_and_label, write_recording};
+use crate::simulator::recorder::record::{drive_and_label, write_recording};
 
 /// What the model drives of each take of the training set.
 const LAPS: f64 = 0.5;

@@ -9,10 +9,10 @@ use serde_json::Value;
 
 use super::job::{Stages, test_on_tracks};
 use super::{TrackResult, training_set};
-use crate::atomic_file;
 use crate::dataset::colour::Colour;
 use crate::dataset::split::SplitMode;
 use crate::error::{Error, Result};
+use crate::files::atomic_file;
 use crate::pilot::Pilot;
 use crate::recipe::Recipe;
 use crate::simulator::DriveOptions;

@@ -9,8 +9,8 @@ use serde::{Deserialize, Serialize};
 
 use super::training_set::{self, Take};
 use super::{MainJobResult, TRACKS, TrackResult, dagger, test_on_track};
-use crate::atomic_file;
 use crate::error::{Error, Result};
+use crate::files::atomic_file;
 use crate::pilot::Pilot;
 use crate::recipe::Recipe;
 use crate::simulator::{DriveOptions, Track};

@@ -10,13 +10,14 @@ use std::path::Path;
 use serde::Serialize;
 
 use crate::error::{Error, Result};
-use crate::new_folder::NewFolder;
+use crate::files::new_folder::NewFolder;
 use crate::pilot::Pilot;
 use crate::report::map;
-use crate::simulator::drive::write_trajectories;
-use crate::simulator::eye::Eye;
-use crate::simulator::recorder::drive_expert;
-use crate::simulator::{DriveOptions, DriveSummary, Driver, HEIGHT, RecordOptions, Track, WIDTH, drive};
+use crate::simulator::camera::eye::Eye;
+use crate::simulator::recorder::record::drive_expert;
+use crate::simulator::trial::drive::drive;
+use crate::simulator::trial::drive::write_trajectories;
+use crate::simulator::{DriveOptions, DriveSummary, Driver, HEIGHT, RecordOptions, Track, WIDTH};
 use crate::training::TrainResult;
 
 /// Tracks that the main job drives on: those of the training set, then held-out ones.

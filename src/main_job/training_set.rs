@@ -8,7 +8,7 @@ use serde::Serialize;
 use sha2::{Digest, Sha256};
 
 use crate::error::{Error, Result};
-use crate::new_folder::NewFolder;
+use crate::files::new_folder::NewFolder;
 use crate::simulator::{RecordOptions, Track, record};
 
 /// Random tracks in the set. Variety of looks teaches more than laps: each is driven for a fraction of a lap.
@@ -177,7 +177,7 @@ pub(super) fn record_takes(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::simulator::recorder::drive_expert;
+    use crate::simulator::recorder::record::drive_expert;
     use crate::simulator::{Camera, Mount, Renderer, RgbFrame, Variant};
 
     #[test]

@@ -9,7 +9,9 @@ use super::map::{self, Place};
 use super::palette;
 use crate::error::{Error, Result};
 use crate::recipe::Recipe;
-use crate::simulator::trajectory::{RUN_DEPTH, Waypoint, find_drives, read_summary, read_trajectory, trajectories};
+use crate::simulator::trial::trajectory::{
+    RUN_DEPTH, Waypoint, find_drives, read_summary, read_trajectory, trajectories,
+};
 use crate::simulator::{DriveSummary, Track};
 use crate::training::{EpochRecord, RunFolder, TrainResult};
 use steersman_kernels::Isa;
@@ -120,7 +122,7 @@ fn figures(page: &mut Page, runs: &[RunView]) -> Result<()> {
             run.name.clone(),
             run.recipe.name.clone(),
             run.seed.to_string(),
-            crate::network::group_digits(network.count(true) as u64),
+            crate::engine::network::group_digits(network.count(true) as u64),
             format!("{}{}", run.history.len(), if run.result.is_some() { "" } else { " (unfinished)" }),
             best.map_or("-".into(), |best| best.epoch.to_string()),
             number(run.history.last().map(|last| last.train_loss), 5),

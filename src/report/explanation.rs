@@ -6,8 +6,8 @@ use super::html::{Figure, Page};
 use super::picture::{HUMAN, MODEL, STEERING_SCALE};
 use super::saliency::Saliency;
 use crate::dataset::decode::RgbImage;
+use crate::engine::network::LayerSpec;
 use crate::error::Result;
-use crate::network::LayerSpec;
 use crate::pilot::Pilot;
 
 /// Pictures with saliency.

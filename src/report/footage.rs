@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 use crate::dataset::decode::{RgbImage, decode_rgb};
 use crate::dataset::{self, Camera};
 use crate::error::{Error, Result};
-use crate::simulator::jpeg::RoundTrip;
-use crate::simulator::recorder::{Sample, drive_expert};
+use crate::simulator::camera::jpeg::RoundTrip;
+use crate::simulator::recorder::record::{Sample, drive_expert};
 use crate::simulator::{Camera as View, HEIGHT, Mount, RecordOptions, Renderer, RgbFrame, Track, Variant, WIDTH};
 
 /// Where the pictures come from.

@@ -3,8 +3,8 @@
 use super::palette::{INK, QUIET_INK, heat_hex};
 use super::svg::{Anchor, Svg};
 use crate::error::{Error, Result};
-use crate::new_folder::NewFolder;
-use crate::simulator::run::Moment;
+use crate::files::new_folder::NewFolder;
+use crate::simulator::trial::run::Moment;
 use crate::simulator::{DriveResult, DriveSummary, Track};
 
 /// Distance from the line that has the darkest colour, m.

@@ -2,8 +2,8 @@
 
 use super::palette::{BLUE, GREEN, INK, ORANGE, PALE, QUIET_INK};
 use super::svg::{Anchor, Svg};
-use crate::network::{LayerSpec, Network, group_digits};
-use crate::tensor::Shape;
+use crate::engine::network::{LayerSpec, Network, group_digits};
+use crate::engine::tensor::Shape;
 
 /// Width of the drawing, pixels.
 const WIDTH: f64 = 1120.0;

@@ -10,11 +10,11 @@ use super::picture::{self, STEERING_SCALE};
 use super::split_view::SplitView;
 use super::steering::histogram;
 use super::{Metrics, Prediction, network_diagram, palette};
-use crate::atomic_file;
 use crate::dataset::held_out::trained_on_held_out;
 use crate::dataset::{Camera, Item};
+use crate::engine::network::{Network, group_digits};
 use crate::error::Result;
-use crate::network::{Network, group_digits};
+use crate::files::atomic_file;
 use crate::pilot::Pilot;
 use crate::training::{Data, EpochRecord, RunFolder, RunInfo, TrainResult};
 

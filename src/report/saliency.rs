@@ -10,8 +10,8 @@
 
 use crate::dataset::decode::RgbImage;
 use crate::dataset::preprocess::Preprocessing;
+use crate::engine::network::{LayerSpec, Network};
 use crate::error::{Error, Result};
-use crate::network::{LayerSpec, Network};
 use crate::pilot::Pilot;
 
 /// Largest share of the overlay's colour.
@@ -364,7 +364,7 @@ mod tests {
     #[test]
     fn a_network_without_convolution_has_none() {
         let network =
-            Network::new(crate::tensor::Shape::new(1, 4, 4), &[LayerSpec::Flatten {}], Isa::PORTABLE).unwrap();
+            Network::new(crate::engine::tensor::Shape::new(1, 4, 4), &[LayerSpec::Flatten {}], Isa::PORTABLE).unwrap();
         assert!(Saliency::new(&network).unwrap_err().to_string().contains("no convolution"));
     }
 }

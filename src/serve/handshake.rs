@@ -1,7 +1,7 @@
 //! The HTTP request that opens a WebSocket: accepted, or refused with one sentence that names the remedy.
 
 use super::protocol::EngineVersion;
-use crate::http::{self, BadHead, Head, is_fixed_name};
+use crate::net::http::{self, BadHead, Head, is_fixed_name};
 
 /// What is to be done with a client after what it has sent so far.
 #[derive(Clone, Debug, PartialEq, Eq)]

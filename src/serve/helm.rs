@@ -3,7 +3,7 @@
 use std::time::Instant;
 
 use super::protocol::Command;
-use crate::simulator::speed::{SpeedController, slower_in_bends_mph};
+use crate::simulator::car::speed::{SpeedController, slower_in_bends_mph};
 
 /// How the car is driven.
 #[derive(Clone, Copy, Debug, PartialEq)]

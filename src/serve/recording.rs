@@ -16,7 +16,7 @@ use time::OffsetDateTime;
 use super::helm::Clock;
 use super::protocol::Command;
 use crate::error::{Error, Result};
-use crate::new_folder::create_now;
+use crate::files::new_folder::create_now;
 
 /// Rows on their way to the disk; a second or two of driving.
 const QUEUE: usize = 64;
@@ -207,7 +207,8 @@ mod tests {
     use std::time::Instant;
 
     use crate::dataset;
-    use crate::simulator::{RgbFrame, jpeg};
+    use crate::simulator::RgbFrame;
+    use crate::simulator::camera::jpeg;
 
     fn image() -> Vec<u8> {
         let mut bytes = Vec::new();

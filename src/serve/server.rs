@@ -20,7 +20,7 @@ use super::recording::{Recorded, Recorder};
 use super::registry::Registry;
 use super::seat::Seat;
 use crate::error::{Error, Result};
-use crate::http;
+use crate::net::http;
 use crate::pilot::Pilot;
 
 /// Connections that are kept at once.

@@ -5,9 +5,10 @@ use std::path::Path;
 
 use sha2::{Digest, Sha256};
 
-use super::run::run;
-use super::spec::TrackSpec;
-use super::trajectory::trajectory_csv;
+use super::road::builtin;
+use super::road::spec::TrackSpec;
+use super::trial::run::run;
+use super::trial::trajectory::trajectory_csv;
 use super::*;
 use crate::Error;
 
@@ -40,7 +41,7 @@ fn built_in_tracks_keep_their_promises() {
 
 #[test]
 fn held_out_tracks_look_like_no_training_track() {
-    use super::spec::{Centre, Edge, Plant, Surface, Wall};
+    use super::road::spec::{Centre, Edge, Plant, Surface, Wall};
     let reserved = |track: &Track| {
         let looks = &track.spec.look;
         let surface = looks.iter().any(|l| matches!(l.surface, Surface::Concrete | Surface::Gravel));

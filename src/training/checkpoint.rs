@@ -5,10 +5,10 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use super::history::EpochRecord;
+use crate::engine::network::{Network, Parameters};
+use crate::engine::optimizer::{Optimizer, Plateau};
 use crate::error::{Error, Result};
 use crate::model_file::{self, StoredTensor};
-use crate::network::{Network, Parameters};
-use crate::optimizer::{Optimizer, Plateau};
 
 const FORMAT: u32 = 1;
 const OPTIMIZER_FIRST: &str = "optimizer.first";
@@ -122,7 +122,7 @@ impl State {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::optimizer::OptimizerSpec;
+    use crate::engine::optimizer::OptimizerSpec;
     use crate::recipe::Recipe;
     use steersman_kernels::Isa;
 

@@ -5,13 +5,13 @@ use std::sync::Arc;
 
 use sha2::{Digest, Sha256};
 
-use crate::atomic_file;
 use crate::dataset::cache::{CacheSpec, Overflow};
 use crate::dataset::leak::LeakAudit;
 use crate::dataset::loader::{Loader, LoaderSpec};
 use crate::dataset::split::{Split, split};
 use crate::dataset::{self, Item, Recording};
 use crate::error::{Error, Result};
+use crate::files::atomic_file;
 use crate::recipe::Recipe;
 
 /// Recordings that have been read and split.

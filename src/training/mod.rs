@@ -22,7 +22,7 @@ mod session;
 mod transfer;
 mod validation;
 
-pub use crate::loss::Loss;
+pub use crate::engine::loss::Loss;
 pub use checkpoint::{Progress, State};
 pub use data::Data;
 pub use history::{EpochRecord, read_history, write_history};

@@ -6,8 +6,8 @@ use cpu_time::ProcessTime;
 use serde::{Deserialize, Serialize};
 
 use crate::dataset::loader::LoaderTimes;
-use crate::network::{Network, TrainingPlan};
-use crate::stopwatch::Stopwatch;
+use crate::engine::network::{Network, TrainingPlan};
+use crate::engine::stopwatch::Stopwatch;
 
 /// The stopwatches of a run.
 #[derive(Debug)]

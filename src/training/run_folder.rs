@@ -7,8 +7,8 @@ use serde::{Deserialize, Serialize};
 
 use super::history::{EpochRecord, read_history};
 use super::session::TrainResult;
-use crate::atomic_file;
 use crate::error::{Error, Result};
+use crate::files::atomic_file;
 use crate::model_file::Transfer;
 use crate::recipe::Recipe;
 

@@ -14,15 +14,15 @@ use super::profile::{Profile, ProfileReport};
 use super::run_folder::{RunFolder, RunInfo};
 use super::transfer::{Start, TransferRequest};
 use super::validation::{Validation, ValidationResult};
-use crate::atomic_file;
 use crate::dataset::held_out::held_out_tracks;
 use crate::dataset::loader::{Batch, Loader};
+use crate::engine::network::{Network, StepInput, TrainingPlan};
+use crate::engine::optimizer::Optimizer;
+use crate::engine::stopwatch::Stopwatch;
 use crate::error::{Error, Result};
+use crate::files::atomic_file;
 use crate::model_file::{Model, TrainingRecord, weights_hash};
-use crate::network::{Network, StepInput, TrainingPlan};
-use crate::optimizer::Optimizer;
 use crate::recipe::{Keep, Recipe};
-use crate::stopwatch::Stopwatch;
 
 /// Most images of one row: three cameras, each mirrored. A batch of whole rows has at least one row.
 const IMAGES_OF_A_ROW: usize = 6;
@@ -429,7 +429,7 @@ impl Session {
     }
 
     /// The weights after `epoch` (from 1) as a model.
-    fn model(&self, parameters: &crate::network::Parameters, epoch: u32) -> Model {
+    fn model(&self, parameters: &crate::engine::network::Parameters, epoch: u32) -> Model {
         let record = self.state.progress.history[epoch as usize - 1];
         Model {
             recipe: self.recipe.clone(),

@@ -5,9 +5,9 @@ use std::path::{Path, PathBuf};
 use steersman_kernels::Isa;
 
 use super::data::Data;
+use crate::engine::network::{Network, Parameters, Tensor};
 use crate::error::{Error, Result};
 use crate::model_file::{Model, Transfer};
-use crate::network::{Network, Parameters, Tensor};
 use crate::recipe::Recipe;
 
 /// Which model to begin from, and what of it stays as it is.

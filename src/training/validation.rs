@@ -3,9 +3,9 @@
 use crate::dataset::Camera;
 use crate::dataset::leak::NearTwins;
 use crate::dataset::loader::{Batch, Loader, LoaderTimes};
+use crate::engine::network::{InferencePlan, Network, Parameters};
+use crate::engine::stopwatch::Stopwatch;
 use crate::error::Result;
-use crate::network::{InferencePlan, Network, Parameters};
-use crate::stopwatch::Stopwatch;
 
 /// How the network does on the validation side.
 #[derive(Clone, Copy, Debug, PartialEq)]

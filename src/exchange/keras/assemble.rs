@@ -9,9 +9,9 @@ use super::architecture::KerasLayer;
 use super::file::Tensor;
 use super::translate::{AxisOrder, KernelLayout, Operation, Step};
 use super::{Problem, check_size, shown};
-use crate::layers::Slopes;
-use crate::network::{LayerSpec, Parameters};
-use crate::tensor::{Initializer, Shape};
+use crate::engine::layers::Slopes;
+use crate::engine::network::{LayerSpec, Parameters};
+use crate::engine::tensor::{Initializer, Shape};
 
 /// Most numbers of an imported network: 256 MiB.
 const MAX_NUMBERS: usize = 1 << 26;
@@ -109,7 +109,7 @@ impl Assembler<'_> {
 
     fn push(&mut self, spec: LayerSpec, values: Vec<f32>, statistics: Vec<f32>) -> Result<(), String> {
         let layer = spec.build(self.shape, Isa::PORTABLE)?;
-        let count = |specs: Vec<crate::layers::ParamSpec>| specs.iter().map(|spec| spec.len()).sum::<usize>();
+        let count = |specs: Vec<crate::engine::layers::ParamSpec>| specs.iter().map(|spec| spec.len()).sum::<usize>();
         debug_assert_eq!((count(layer.params()), count(layer.statistics())), (values.len(), statistics.len()));
         if self.parameters.values.len() + values.len() > MAX_NUMBERS {
             return Err(format!("the network would have more than {MAX_NUMBERS} parameters"));

@@ -25,11 +25,11 @@ use self::file::KerasFile;
 use self::lambda::Affine;
 use self::translate::{AxisOrder, Operation, Step};
 use crate::dataset::preprocess::Preprocessing;
+use crate::engine::network::{LayerSpec, Network, Parameters};
+use crate::engine::tensor::Shape;
 use crate::error::{Error, Result};
 use crate::model_file::{Model, TrainingRecord};
-use crate::network::{LayerSpec, Network, Parameters};
 use crate::recipe::Recipe;
-use crate::tensor::Shape;
 
 /// What the user knows beside the file.
 #[derive(Clone, Debug, Default)]

@@ -5,9 +5,9 @@ use serde_json::{Map, Value};
 use super::architecture::KerasLayer;
 use super::lambda::{self, Affine};
 use super::shown;
-use crate::layers::Padding;
-use crate::network::LayerSpec;
-use crate::tensor::Initializer;
+use crate::engine::layers::Padding;
+use crate::engine::network::LayerSpec;
+use crate::engine::tensor::Initializer;
 
 /// Order of the axes of a feature map.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -4,9 +4,9 @@ use std::ops::Range;
 
 use crate::dataset::colour::{Colour, HSV, L_SCALE, L_SHIFT, LAB};
 use crate::dataset::resize::{AreaTaps, LinearTap, Method, Resizer};
+use crate::engine::tensor::Shape;
 use crate::exchange::chain::{Affine, Op, Step, scale_and_shift};
 use crate::recipe::Recipe;
-use crate::tensor::Shape;
 
 /// Everything that the file of a model says.
 pub struct Program<'a> {

@@ -6,8 +6,8 @@ use super::panel::{Names, Panel, Scene};
 use super::{Onlooker, Video, VideoSummary};
 use crate::dataset::decode::RgbImage;
 use crate::error::{Error, Result};
-use crate::simulator::car::MAX_STEER_DEG;
-use crate::simulator::run::{DRIVE_HZ, Failure};
+use crate::simulator::car::dynamics::MAX_STEER_DEG;
+use crate::simulator::trial::run::{DRIVE_HZ, Failure};
 use crate::simulator::{DriveFrame, DriveObserver, Driver, HEIGHT, Run, RunOptions, Track, WIDTH, run_observed};
 
 /// A video of a run that is yet to be driven.
@@ -45,7 +45,7 @@ impl DriveVideo {
         Ok(DriveVideo { video, scene, onlooker })
     }
 
-    /// Drives the run `seed`, as [`run`](crate::simulator::run::run) does and to the same bits, and writes the video. `progress`
+    /// Drives the run `seed`, as [`run`](crate::simulator::trial::run::run) does and to the same bits, and writes the video. `progress`
     /// is told the share of the way that is made and may return `false` to stop; what there is by then is written, and the second
     /// value is `true`.
     ///

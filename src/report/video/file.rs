@@ -9,9 +9,9 @@ use rusty_h264_common::{Profile, YuvPlanes};
 use rusty_h264_encoder::{Encoder, EncoderConfig, Preset};
 
 use super::VideoSummary;
-use crate::atomic_file::NewFile;
 use crate::dataset::decode::RgbImage;
 use crate::error::{Error, Result};
+use crate::files::atomic_file::NewFile;
 
 /// Ticks of the file's clock in a second.
 const TICKS_PER_S: u32 = 90_000;

@@ -11,7 +11,7 @@ use crate::report::map::{self, Projection};
 use crate::report::palette::heat;
 use crate::report::picture::{HUMAN, MODEL};
 use crate::simulator::Track;
-use crate::simulator::car::MAX_STEER_DEG;
+use crate::simulator::car::dynamics::MAX_STEER_DEG;
 
 /// Height and width of a picture of the video.
 const SIZE: [usize; 2] = [480, 960];

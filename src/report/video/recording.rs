@@ -7,7 +7,7 @@ use super::{Onlooker, Video, VideoSummary};
 use crate::dataset::decode::decode_rgb;
 use crate::dataset::{self, Camera, Recording};
 use crate::error::{Error, Result};
-use crate::simulator::car::MAX_STEER_DEG;
+use crate::simulator::car::dynamics::MAX_STEER_DEG;
 
 /// Pictures a second where no session has two rows.
 const LONE_ROW_HZ: f64 = 20.0;

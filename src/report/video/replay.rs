@@ -7,11 +7,12 @@ use super::{Onlooker, Video, VideoSummary};
 use crate::dataset::decode::RgbImage;
 use crate::error::{Error, Result};
 use crate::report::lettering::end_of;
-use crate::simulator::car::{MAX_STEER_DEG, MPS_PER_MPH};
-use crate::simulator::eye::Eye;
-use crate::simulator::run::DRIVE_HZ;
-use crate::simulator::trajectory::{Waypoint, read_summary, read_trajectory, trajectories};
-use crate::simulator::{HEIGHT, Simulation, Track, WIDTH, expert};
+use crate::simulator::camera::eye::Eye;
+use crate::simulator::car::dynamics::{MAX_STEER_DEG, MPS_PER_MPH};
+use crate::simulator::car::expert;
+use crate::simulator::trial::run::DRIVE_HZ;
+use crate::simulator::trial::trajectory::{Waypoint, read_summary, read_trajectory, trajectories};
+use crate::simulator::{HEIGHT, Simulation, Track, WIDTH};
 
 /// Which run of a drive, and how.
 #[derive(Clone, Copy, Debug, Default)]

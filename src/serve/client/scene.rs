@@ -8,13 +8,13 @@ use super::connection::{Connection, Event};
 use super::handshake::ServerUrl;
 use super::reaction::{Numbers, Steer};
 use crate::serve::protocol::{DecimalMark, Readings, print_telemetry};
-use crate::simulator::car::{MAX_STEER_DEG, STEP_S};
-use crate::simulator::closed_loop::ClosedLoop;
-use crate::simulator::expert::pursuit;
-use crate::simulator::eye::Eye;
-use crate::simulator::run::{Run, RunOptions};
-use crate::simulator::speed::{Speed, telemetry_mph};
-use crate::simulator::track::Track;
+use crate::simulator::camera::eye::Eye;
+use crate::simulator::car::dynamics::{MAX_STEER_DEG, STEP_S};
+use crate::simulator::car::expert::pursuit;
+use crate::simulator::car::speed::{Speed, telemetry_mph};
+use crate::simulator::road::track::Track;
+use crate::simulator::trial::closed_loop::ClosedLoop;
+use crate::simulator::trial::run::{Run, RunOptions};
 use crate::{Error, Result};
 
 /// Most simulated time that one frame may make up for (Unity's maximum allowed timestep), s.

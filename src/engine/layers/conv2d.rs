@@ -1,0 +1,258 @@
+//! 2-D convolution.
+
+use serde::{Deserialize, Serialize};
+use steersman_kernels::Isa;
+use steersman_kernels::conv::{Conv, ConvShape};
+
+use super::{Grads, Layer, Linear, Pair, ParamSpec, Pass, Prepared};
+use crate::engine::tensor::{Fans, Initializer, Shape};
+
+/// What lies beyond the border of the image.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Padding {
+    /// Nothing: the kernel stays inside the image; output size ⌊(size − kernel) / stride⌋ + 1.
+    #[default]
+    Valid,
+    /// Zeros, so that the output size is ⌈size / stride⌉; an odd number of zeros has the larger half below and to the right
+    /// (as in TensorFlow).
+    Same,
+}
+
+impl Padding {
+    /// Zeros before and after, along one axis.
+    pub(crate) fn amounts(self, size: usize, kernel: usize, stride: usize) -> (usize, usize) {
+        match self {
+            Padding::Valid => (0, 0),
+            Padding::Same => {
+                let total = ((size.div_ceil(stride) - 1) * stride + kernel).saturating_sub(size);
+                (total / 2, total - total / 2)
+            }
+        }
+    }
+}
+
+/// 2-D convolution with bias (a cross-correlation, as in every framework).
+///
+/// **Forward** `y[o][i][j] = bias[o] + Σ_{c,k,l} weight[o][c][k][l] · x[c][i·s + k − p][j·s + l − p]`.
+/// **Backward** needs x: `dweight = Σ_{i,j} dy[o][i][j] · x[c][i·s + k − p][j·s + l − p]`, `dbias = Σ dy`, and `dx` is the
+/// convolution of the (spread, padded) `dy` with the kernel turned by 180°.
+/// Training and evaluation are the same. Any kernel size and stride.
+///
+/// Parameters: `weight` `[filters][channels][kernel height][kernel width]`, `bias` `[filters]`.
+#[derive(Clone, Debug)]
+pub struct Conv2d {
+    conv: Conv,
+    shape: ConvShape,
+    init: Initializer,
+}
+
+impl Conv2d {
+    /// A convolution of `filters` kernels of size `kernel` (height, width) over `input`, or what does not fit.
+    pub fn new(
+        input: Shape,
+        filters: usize,
+        kernel: [usize; 2],
+        stride: [usize; 2],
+        padding: Padding,
+        init: Initializer,
+        isa: Isa,
+    ) -> Result<Conv2d, String> {
+        let [kh, kw] = kernel;
+        let [stride_h, stride_w] = stride;
+        if filters == 0 || kh == 0 || kw == 0 || stride_h == 0 || stride_w == 0 {
+            return Err("filters, kernel and stride must be at least 1".into());
+        }
+        let (pad_top, pad_bottom) = padding.amounts(input.h, kh, stride_h);
+        let (pad_left, pad_right) = padding.amounts(input.w, kw, stride_w);
+        if input.h + pad_top + pad_bottom < kh || input.w + pad_left + pad_right < kw {
+            return Err(format!("a {kh}x{kw} kernel does not fit into the {}x{} input", input.h, input.w));
+        }
+        let shape = ConvShape {
+            c: input.c,
+            h: input.h,
+            w: input.w,
+            oc: filters,
+            kh,
+            kw,
+            stride_h,
+            stride_w,
+            pad_top,
+            pad_bottom,
+            pad_left,
+            pad_right,
+        };
+        Ok(Conv2d { conv: Conv::new(shape, isa), shape, init })
+    }
+
+    /// The kernel that computes it.
+    pub(super) fn kernel(&self) -> &Conv {
+        &self.conv
+    }
+
+    /// Weight and bias.
+    pub(super) fn split<'a>(&self, params: &'a [f32]) -> (&'a [f32], &'a [f32]) {
+        params.split_at(self.weight_len())
+    }
+
+    /// What is prepared for the forward pass and for the input gradient, if anything is.
+    fn split_prepared<'a>(&self, prepared: &'a [f32]) -> Option<(&'a [f32], &'a [f32])> {
+        (!prepared.is_empty()).then(|| prepared.split_at(self.conv.packed_len()))
+    }
+
+    fn weight_len(&self) -> usize {
+        self.shape.oc * self.shape.c * self.shape.kh * self.shape.kw
+    }
+}
+
+impl Layer for Conv2d {
+    fn input(&self) -> Shape {
+        Shape::new(self.shape.c, self.shape.h, self.shape.w)
+    }
+
+    fn output(&self) -> Shape {
+        Shape::new(self.shape.oc, self.shape.out_h(), self.shape.out_w())
+    }
+
+    fn params(&self) -> Vec<ParamSpec> {
+        let ConvShape { c, oc, kh, kw, .. } = self.shape;
+        let fans = Fans { fan_in: c * kh * kw, fan_out: oc * kh * kw };
+        vec![ParamSpec::weight(vec![oc, c, kh, kw], self.init, fans), ParamSpec::constant("bias", vec![oc], 0.0)]
+    }
+
+    fn multiply_adds(&self) -> u64 {
+        self.shape.multiply_adds()
+    }
+
+    fn scratch_len(&self, _n: usize) -> usize {
+        self.conv.scratch_len()
+    }
+
+    fn infer(&self, params: &[f32], _statistics: &[f32], n: usize, x: &[f32], y: &mut [f32], scratch: &mut [f32]) {
+        let (weight, bias) = self.split(params);
+        self.conv.forward(n, x, weight, bias, y, scratch);
+    }
+
+    fn forward(&self, params: &[f32], pass: &Pass, n: usize, x: &[f32], y: &mut [f32], scratch: &mut [f32]) {
+        match self.split_prepared(pass.prepared) {
+            Some((prepared, _)) => self.conv.forward_packed(n, x, prepared, y, scratch),
+            None => self.infer(params, &[], n, x, y, scratch),
+        }
+    }
+
+    fn backward(&self, params: &[f32], pass: &Pass, n: usize, pair: Pair, dx: Option<&mut [f32]>, grads: Grads) {
+        let (dweight, dbias) = grads.dparams.split_at_mut(self.weight_len());
+        self.conv.backward_weight(n, pair.x, pair.dy, dweight, dbias, grads.scratch);
+        if let Some(dx) = dx {
+            self.backward_input(params, pass, n, pair.dy, dx, grads.scratch);
+        }
+    }
+
+    fn prepared(&self) -> Option<&dyn Prepared> {
+        Some(self)
+    }
+
+    fn linear(&self) -> Option<&dyn Linear> {
+        Some(self)
+    }
+}
+
+impl Prepared for Conv2d {
+    fn prepared_len(&self) -> usize {
+        self.conv.packed_len()
+    }
+
+    fn prepare(&self, params: &[f32], prepared: &mut [f32]) {
+        let (weight, bias) = self.split(params);
+        self.conv.pack(weight, bias, prepared);
+    }
+
+    fn prepared_for_training_len(&self) -> usize {
+        self.conv.packed_len() + self.conv.packed_gradient_len()
+    }
+
+    fn prepare_for_training(&self, params: &[f32], prepared: &mut [f32]) {
+        let (forward, gradient) = prepared.split_at_mut(self.conv.packed_len());
+        let (weight, bias) = self.split(params);
+        self.conv.pack(weight, bias, forward);
+        self.conv.pack_gradient(weight, gradient);
+    }
+
+    fn infer_prepared(&self, prepared: &[f32], n: usize, x: &[f32], y: &mut [f32], scratch: &mut [f32]) {
+        self.conv.forward_packed(n, x, prepared, y, scratch);
+    }
+}
+
+impl Linear for Conv2d {
+    fn backward_input(&self, params: &[f32], pass: &Pass, n: usize, dy: &[f32], dx: &mut [f32], scratch: &mut [f32]) {
+        match self.split_prepared(pass.prepared) {
+            Some((_, prepared)) => self.conv.backward_input_packed(n, dy, prepared, dx, scratch),
+            None => self.conv.backward_input(n, dy, &params[..self.weight_len()], dx, scratch),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::gradcheck::check_layer;
+    use super::*;
+
+    fn conv(
+        [c, h, w]: [usize; 3],
+        filters: usize,
+        kernel: [usize; 2],
+        stride: [usize; 2],
+        padding: Padding,
+        isa: Isa,
+    ) -> Conv2d {
+        Conv2d::new(Shape::new(c, h, w), filters, kernel, stride, padding, Initializer::GlorotUniform, isa).unwrap()
+    }
+
+    #[test]
+    fn gradients_hold_for_odd_sizes_strides_and_paddings() {
+        for isa in Isa::available() {
+            for padding in [Padding::Valid, Padding::Same] {
+                for (n, input, filters, kernel, stride) in [
+                    (1, [1, 3, 3], 1, [3, 3], [1, 1]),
+                    (2, [3, 7, 9], 5, [3, 3], [1, 1]),
+                    (3, [2, 6, 21], 9, [3, 3], [1, 1]),
+                    (2, [3, 9, 11], 4, [5, 5], [2, 2]),
+                    (1, [2, 8, 7], 3, [5, 3], [3, 2]),
+                    (2, [4, 5, 6], 2, [1, 1], [1, 1]),
+                    (2, [2, 5, 6], 3, [2, 4], [1, 3]),
+                    (1, [2, 3, 40], 8, [3, 3], [1, 1]),
+                ] {
+                    check_layer(&conv(input, filters, kernel, stride, padding, isa), n);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn same_padding_keeps_the_size_and_puts_the_odd_zero_last() {
+        let layer = conv([1, 5, 6], 1, [2, 3], [1, 2], Padding::Same, Isa::best());
+        assert_eq!(layer.output(), Shape::new(1, 5, 3));
+        let (s, x) = (layer.shape, 1.0);
+        assert_eq!((s.pad_top, s.pad_bottom, s.pad_left, s.pad_right), (0, 1, 0, 1));
+        let mut y = [f32::NAN; 15];
+        let mut scratch = vec![f32::NAN; layer.scratch_len(1)];
+        let params = [1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.0];
+        layer.infer(&params, &[], 1, &[x; 30], &mut y, &mut scratch);
+        assert_eq!(y, [6., 6., 4., 6., 6., 4., 6., 6., 4., 6., 6., 4., 3., 3., 2.]);
+    }
+
+    #[test]
+    fn a_kernel_larger_than_the_image_is_refused() {
+        let error = Conv2d::new(
+            Shape::new(1, 4, 4),
+            1,
+            [5, 5],
+            [1, 1],
+            Padding::Valid,
+            Initializer::GlorotUniform,
+            Isa::PORTABLE,
+        )
+        .unwrap_err();
+        assert_eq!(error, "a 5x5 kernel does not fit into the 4x4 input");
+    }
+}

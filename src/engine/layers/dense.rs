@@ -1,0 +1,123 @@
+//! Fully connected layer.
+
+use steersman_kernels::Isa;
+use steersman_kernels::gemm::{gemm, gemm_scratch_len};
+
+use super::{Grads, Layer, Linear, Pair, ParamSpec, Pass};
+use crate::engine::tensor::{Fans, Initializer, Shape};
+
+/// Fully connected layer with bias.
+///
+/// **Forward** `y = W·x + b`. **Backward** needs x: `dW = dy·xᵀ`, `db = dy`, `dx = Wᵀ·dy`.
+/// Training and evaluation are the same. The input is taken as a vector in the order channel, row, column.
+///
+/// Parameters: `weight` `[units][inputs]`, `bias` `[units]`.
+#[derive(Debug)]
+pub struct Dense {
+    inputs: usize,
+    input: Shape,
+    units: usize,
+    init: Initializer,
+    isa: Isa,
+}
+
+impl Dense {
+    /// `units` outputs from all numbers of `input`.
+    pub fn new(input: Shape, units: usize, init: Initializer, isa: Isa) -> Result<Dense, String> {
+        if units == 0 {
+            return Err("units must be at least 1".into());
+        }
+        Ok(Dense { inputs: input.len(), input, units, init, isa })
+    }
+}
+
+impl Layer for Dense {
+    fn input(&self) -> Shape {
+        self.input
+    }
+
+    fn output(&self) -> Shape {
+        Shape::vector(self.units)
+    }
+
+    fn params(&self) -> Vec<ParamSpec> {
+        let fans = Fans { fan_in: self.inputs, fan_out: self.units };
+        vec![
+            ParamSpec::weight(vec![self.units, self.inputs], self.init, fans),
+            ParamSpec::constant("bias", vec![self.units], 0.0),
+        ]
+    }
+
+    fn multiply_adds(&self) -> u64 {
+        (self.inputs * self.units) as u64
+    }
+
+    fn scratch_len(&self, n: usize) -> usize {
+        let (i, u) = (self.inputs, self.units);
+        gemm_scratch_len(n, i, u).max(gemm_scratch_len(u, n, i)).max(gemm_scratch_len(n, u, i))
+    }
+
+    fn infer(&self, params: &[f32], _statistics: &[f32], n: usize, x: &[f32], y: &mut [f32], scratch: &mut [f32]) {
+        let (inputs, units) = (self.inputs, self.units);
+        let (weight, bias) = params.split_at(inputs * units);
+        for row in y[..n * units].chunks_exact_mut(units) {
+            row.copy_from_slice(bias);
+        }
+        gemm(self.isa, n, inputs, units, 1.0, x, (inputs, 1), weight, (1, inputs), 1.0, y, (units, 1), scratch);
+    }
+
+    fn forward(&self, params: &[f32], _pass: &Pass, n: usize, x: &[f32], y: &mut [f32], scratch: &mut [f32]) {
+        self.infer(params, &[], n, x, y, scratch);
+    }
+
+    fn backward(&self, params: &[f32], pass: &Pass, n: usize, pair: Pair, dx: Option<&mut [f32]>, grads: Grads) {
+        let Pair { x, dy, .. } = pair;
+        let Grads { dparams, scratch } = grads;
+        let (inputs, units) = (self.inputs, self.units);
+        let (dweight, dbias) = dparams.split_at_mut(inputs * units);
+        gemm(self.isa, units, n, inputs, 1.0, dy, (1, units), x, (inputs, 1), 1.0, dweight, (inputs, 1), scratch);
+        for row in dy[..n * units].chunks_exact(units) {
+            for (sum, d) in dbias.iter_mut().zip(row) {
+                *sum += d;
+            }
+        }
+        if let Some(dx) = dx {
+            self.backward_input(params, pass, n, dy, dx, scratch);
+        }
+    }
+
+    fn linear(&self) -> Option<&dyn Linear> {
+        Some(self)
+    }
+}
+
+impl Linear for Dense {
+    fn backward_input(&self, params: &[f32], _pass: &Pass, n: usize, dy: &[f32], dx: &mut [f32], scratch: &mut [f32]) {
+        let (inputs, units) = (self.inputs, self.units);
+        let weight = &params[..inputs * units];
+        gemm(self.isa, n, units, inputs, 1.0, dy, (units, 1), weight, (inputs, 1), 0.0, dx, (inputs, 1), scratch);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::gradcheck::check_layer;
+    use super::*;
+
+    #[test]
+    fn gradients_hold() {
+        for isa in Isa::available() {
+            for (n, inputs, units) in [(1, 1, 1), (1, 7, 3), (5, 3, 7), (4, 33, 17), (9, 2, 1)] {
+                check_layer(&Dense::new(Shape::vector(inputs), units, Initializer::GlorotUniform, isa).unwrap(), n);
+            }
+        }
+    }
+
+    #[test]
+    fn rows_of_the_weight_are_units() {
+        let layer = Dense::new(Shape::vector(2), 3, Initializer::GlorotUniform, Isa::best()).unwrap();
+        let (mut y, mut scratch) = ([f32::NAN; 3], vec![f32::NAN; layer.scratch_len(1)]);
+        layer.infer(&[1., 2., 3., 4., 5., 6., 0.5, 0., -0.5], &[], 1, &[10., 1.], &mut y, &mut scratch);
+        assert_eq!(y, [12.5, 34., 55.5]);
+    }
+}

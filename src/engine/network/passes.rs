@@ -1,0 +1,185 @@
+//! The passes of a training step over some images of a shard: what all shards share, and the stages forward and backward.
+
+use std::ops::Range;
+
+use super::shard::Shard;
+use super::stages::{Kind, Stage, replaces_input};
+use super::step_profile::StepTimes;
+use super::training::StepInput;
+use super::{Network, Parameters};
+use crate::engine::layers::{BatchStatistics, Grads, Pair, Pass};
+use crate::engine::loss::Loss;
+
+/// What all shards share during a pass.
+#[derive(Clone, Copy)]
+pub(super) struct Run<'a> {
+    pub network: &'a Network,
+    pub parameters: &'a Parameters,
+    pub stages: &'a [Stage],
+    pub prepared: &'a [Vec<f32>],
+    pub moments: &'a [f32],
+    pub moments_of: &'a [Range<usize>],
+    pub first_learning: usize,
+    pub input: StepInput<'a>,
+    pub times: &'a StepTimes,
+}
+
+impl<'a> Run<'a> {
+    fn pass(&self, stage: usize, first_image: usize) -> Pass<'a> {
+        let moments = &self.moments[self.moments_of[stage].clone()];
+        let layer = self.stages[stage].layers.start;
+        Pass {
+            seed: self.input.seed,
+            step: self.input.step,
+            layer,
+            first_image,
+            moments,
+            prepared: &self.prepared[stage],
+        }
+    }
+
+    fn params(&self, stage: usize) -> &'a [f32] {
+        &self.parameters.values[self.stages[stage].params(self.network)]
+    }
+
+    /// The input of `stage` for `images` of the batch; `first` is that whose activations come first.
+    fn stage_input<'b>(
+        &self,
+        stage: usize,
+        activations: &'b [Vec<f32>],
+        first: usize,
+        images: Range<usize>,
+    ) -> &'b [f32]
+    where
+        'a: 'b,
+    {
+        let len = self.stages[stage].input_len(self.network);
+        match self.stages[stage].source {
+            Some(source) => &activations[source][(images.start - first) * len..][..images.len() * len],
+            None => &self.input.x[images.start * len..images.end * len],
+        }
+    }
+
+    pub fn forward(&self, stages: Range<usize>, shard: &mut Shard, images: Range<usize>) {
+        for index in stages {
+            let stage = &self.stages[index];
+            let (before, from_here) = shard.buffers.activations.split_at_mut(index);
+            let x = self.stage_input(index, before, shard.first, images.clone());
+            let (n, offset) = (images.len(), images.start - shard.first);
+            let outputs = stage.output_len(self.network);
+            let y = &mut from_here[0][offset * outputs..][..n * outputs];
+            let (params, pass) = (self.params(index), self.pass(index, images.start));
+            self.times.stages[index][0].time(|| match &stage.kind {
+                Kind::Layer => {
+                    let layer = &self.network.layers()[stage.layers.start].layer;
+                    layer.forward(params, &pass, n, x, y, &mut shard.scratch);
+                }
+                Kind::NormRectify(fused) => fused.forward(params, &pass, n, x, y),
+                Kind::PooledConv(fused) => {
+                    let places = &mut shard.buffers.places[index][offset * outputs..][..n * outputs];
+                    fused.forward(&pass, n, x, y, places, &mut shard.scratch);
+                }
+            });
+        }
+    }
+
+    /// Adds the images' losses to the shard's, and puts the gradient of the mean loss into `d_output`.
+    pub fn loss(&self, loss: &Loss, shard: &mut Shard, images: Range<usize>) {
+        debug_assert_eq!(images.start, shard.first, "the loss is taken of all images in the buffers");
+        let outputs = self.network.output().len();
+        let predictions = match shard.buffers.activations.last() {
+            Some(last) => &last[..images.len() * outputs],
+            None => &self.input.x[images.start * outputs..images.end * outputs],
+        };
+        let labels = &self.input.labels[images.start * outputs..images.end * outputs];
+        let scale = 1.0 / self.input.labels.len() as f32;
+        shard.loss +=
+            loss.value_and_gradient(predictions, labels, scale, &mut shard.buffers.d_output[..predictions.len()]);
+        shard.buffers.in_place = false;
+    }
+
+    /// Takes the gradient of the output of the last of `stages` back to the input of the first.
+    pub fn backward(&self, stages: Range<usize>, shard: &mut Shard, images: Range<usize>) {
+        for index in stages.rev().filter(|index| *index >= self.first_learning) {
+            let stage = &self.stages[index];
+            let n = images.len();
+            let offset = images.start - shard.first;
+            let place = |len: usize| offset * len..(offset + n) * len;
+            let (of_x, of_y) = (place(stage.input_len(self.network)), place(stage.output_len(self.network)));
+            let (params, pass) = (self.params(index), self.pass(index, images.start));
+            let replaces = stage.source.filter(|_| replaces_input(self.network, self.stages, index));
+            // Nobody asks for the gradient of the images themselves, or of what comes before all that learns.
+            let wanted = stage.source.filter(|source| *source >= self.first_learning);
+            self.times.stages[index][1].time(|| match &stage.kind {
+                Kind::NormRectify(fused) => {
+                    let source = replaces.expect("batch norm runs fused only after another stage");
+                    let (in_place, d_output) = (shard.buffers.in_place, std::mem::take(&mut shard.buffers.d_output));
+                    let (x, y) = shard.source_and_output(index, source);
+                    let dy = if in_place { &y[of_y] } else { &d_output[of_y] };
+                    fused.backward(params, &pass, n, &mut x[of_x], dy);
+                    shard.buffers.d_output = d_output;
+                }
+                Kind::PooledConv(fused) => {
+                    let x = self.stage_input(index, &shard.buffers.activations, shard.first, images.clone());
+                    let y = &shard.buffers.activations[index][of_y.clone()];
+                    let pair = Pair { x, y, dy: &shard.buffers.d_output[of_y.clone()] };
+                    let dx = wanted.map(|_| &mut shard.buffers.d_input[of_x]);
+                    let dparams = &mut shard.gradient[stage.params(self.network)];
+                    let grads = Grads { dparams, scratch: &mut shard.scratch };
+                    fused.backward(params, n, pair, &shard.buffers.places[index][of_y], dx, grads);
+                }
+                Kind::Layer => {
+                    let layer = &self.network.layers()[stage.layers.start].layer;
+                    let x = self.stage_input(index, &shard.buffers.activations, shard.first, images.clone());
+                    let y = &shard.buffers.activations[index][of_y.clone()];
+                    let dy = if shard.buffers.in_place { y } else { &shard.buffers.d_output[of_y.clone()] };
+                    let pair = Pair { x, y, dy };
+                    let apart = wanted.is_some() && replaces.is_none();
+                    let dx = if apart { Some(&mut shard.buffers.d_input[of_x.clone()]) } else { None };
+                    let dparams = &mut shard.gradient[stage.params(self.network)];
+                    layer.backward(params, &pass, n, pair, dx, Grads { dparams, scratch: &mut shard.scratch });
+                    if let (Some(linear), Some(source)) = (layer.linear(), replaces.and(wanted)) {
+                        let (before, from_here) = shard.buffers.activations.split_at_mut(index);
+                        let dy =
+                            if shard.buffers.in_place { &from_here[0][of_y] } else { &shard.buffers.d_output[of_y] };
+                        linear.backward_input(params, &pass, n, dy, &mut before[source][of_x], &mut shard.scratch);
+                    }
+                }
+            });
+            shard.buffers.in_place = replaces.is_some();
+            if !shard.buffers.in_place {
+                std::mem::swap(&mut shard.buffers.d_output, &mut shard.buffers.d_input);
+            }
+        }
+    }
+
+    /// Adds the sums over the images that the barrier is for to the shard's.
+    pub fn forward_sums(&self, stage: usize, barrier: &dyn BatchStatistics, shard: &mut Shard, images: Range<usize>) {
+        let x = self.stage_input(stage, &shard.buffers.activations, shard.first, images.clone());
+        let sums = &mut shard.group_sums[..barrier.sums_len()];
+        self.times.stages[stage][0].time(|| barrier.forward_sums(images.len(), x, sums));
+        shard.add_group_sums(barrier.sums_len());
+    }
+
+    /// The same on the way back.
+    pub fn backward_sums(&self, index: usize, barrier: &dyn BatchStatistics, shard: &mut Shard, images: Range<usize>) {
+        let stage = &self.stages[index];
+        let n = images.len();
+        let x = self.stage_input(index, &shard.buffers.activations, shard.first, images.clone());
+        let outputs = stage.output_len(self.network);
+        let of_y = (images.start - shard.first) * outputs..(images.end - shard.first) * outputs;
+        let dy = if shard.buffers.in_place {
+            &shard.buffers.activations[index][of_y]
+        } else {
+            &shard.buffers.d_output[of_y]
+        };
+        let sums = &mut shard.group_sums[..barrier.sums_len()];
+        let moments = self.pass(index, images.start).moments;
+        let dparams = &mut shard.gradient[stage.params(self.network)];
+        self.times.stages[index][1].time(|| match &stage.kind {
+            Kind::Layer | Kind::PooledConv(_) => barrier.backward_sums(moments, n, x, dy, sums, dparams),
+            Kind::NormRectify(fused) => fused.backward_sums(self.params(index), moments, x, dy, sums, dparams),
+        });
+        shard.add_group_sums(barrier.sums_len());
+    }
+}

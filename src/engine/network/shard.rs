@@ -1,0 +1,112 @@
+//! A shard of the batch of a training step, and the buffers it works in.
+
+use std::ops::Range;
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+use super::Network;
+
+/// A part of the batch with a gradient of its own, worked on by one thread at a time.
+#[derive(Debug)]
+pub(super) struct Shard {
+    /// Which images of the batch.
+    pub images: Range<usize>,
+    /// Empty between the steps of a network without a barrier.
+    pub buffers: Buffers,
+    /// Empty while the shard is not worked on.
+    pub scratch: Vec<f32>,
+    /// The image whose activations come first in the buffers.
+    pub first: usize,
+    pub gradient: Vec<f32>,
+    pub sums: Vec<f64>,
+    /// The same of the images that are being worked on.
+    pub group_sums: Vec<f64>,
+    /// Sum of the losses of all images.
+    pub loss: f64,
+}
+
+/// The maps of a shard. With a barrier the activations have to wait there, and each shard has its own. Without one a shard is done
+/// with them when it is done.
+#[derive(Debug, Default)]
+pub(super) struct Buffers {
+    /// Output of each stage.
+    pub activations: Vec<Vec<f32>>,
+    /// Where each [`PooledConv`](crate::engine::layers::PooledConv) found its largest; empty for the others.
+    pub places: Vec<Vec<u32>>,
+    /// Gradient with respect to the current stage's output, and to its input.
+    pub d_output: Vec<f32>,
+    pub d_input: Vec<f32>,
+    /// Whether the gradient with respect to the current stage's output has taken the place of that output instead.
+    pub in_place: bool,
+}
+
+/// Buffers that are not in use. Those put back last are taken first, so that no more are ever touched than threads are at work,
+/// and they are still in the cache.
+#[derive(Debug)]
+pub(super) struct Spare<T>(Mutex<Vec<T>>);
+
+impl<T> Spare<T> {
+    pub fn new(items: Vec<T>) -> Spare<T> {
+        Spare(Mutex::new(items))
+    }
+
+    pub fn take(&self) -> T {
+        self.items().pop().expect("there are as many as shards")
+    }
+
+    pub fn put(&self, item: T) {
+        self.items().push(item);
+    }
+
+    fn items(&self) -> MutexGuard<'_, Vec<T>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Shard {
+    pub fn reset(&mut self) {
+        self.gradient.fill(0.0);
+        self.loss = 0.0;
+    }
+
+    /// Takes scratch for the images between two barriers.
+    pub fn begin_segment(&mut self, spare_scratch: &Spare<Vec<f32>>) {
+        self.scratch = spare_scratch.take();
+        self.first = self.images.start;
+        self.sums.fill(0.0);
+    }
+
+    /// Adds the sums of a group.
+    pub fn add_group_sums(&mut self, len: usize) {
+        for (sum, group) in self.sums[..len].iter_mut().zip(&self.group_sums) {
+            *sum += group;
+        }
+    }
+
+    /// How many images the activations have room for.
+    pub fn group_capacity(&self, network: &Network) -> usize {
+        self.buffers.activations.last().map_or(self.images.len(), |last| last.len() / network.output().len()).max(1)
+    }
+
+    /// Output of stage `stage` and of its source, which comes before it.
+    pub fn source_and_output(&mut self, stage: usize, source: usize) -> (&mut [f32], &mut [f32]) {
+        let (before, from_here) = self.buffers.activations.split_at_mut(stage);
+        (&mut before[source], &mut from_here[0])
+    }
+}
+
+/// `images`, `group` at a time.
+pub(super) fn groups(images: Range<usize>, group: usize) -> impl Iterator<Item = Range<usize>> {
+    images.clone().step_by(group).map(move |start| start..(start + group).min(images.end))
+}
+
+/// Adds the shards' sums up, in their order.
+pub(super) fn total<'a>(shards: &[Shard], len: usize, sums: &'a mut [f64]) -> &'a [f64] {
+    let sums = &mut sums[..len];
+    sums.fill(0.0);
+    for shard in shards {
+        for (total, sum) in sums.iter_mut().zip(&shard.sums) {
+            *total += sum;
+        }
+    }
+    sums
+}

@@ -1,0 +1,302 @@
+//! Which layers run as one.
+//!
+//! | layers | run as | because |
+//! |---|---|---|
+//! | batch norm, ReLU or PReLU, then max pool 2x2 if there is one, after a convolution or dense layer | [`NormRectify`] | one pass over the maps instead of three, and nothing between is written; the gradient of the convolution's output takes its place |
+//! | convolution of stride 1 without padding, ReLU or ELU, max pool 4x4 | [`PooledConv`] | the activation of a 16th of the values; gradients from a 16th of the positions |
+//!
+//! Everything else runs layer by layer, frozen batch norm too. What runs as one computes the same as its layers, up to rounding.
+
+use std::ops::Range;
+
+use super::{LayerSpec, NamedLayer, Network};
+use crate::engine::layers::{BatchNorm, BatchStatistics, Conv2d, NormRectify, PooledConv, Prepared, Rising, Slopes};
+
+/// Neighbouring layers that run as one.
+#[derive(Clone, Debug)]
+pub(super) struct Stage {
+    /// Which layers.
+    pub layers: Range<usize>,
+    pub kind: Kind,
+    /// Which earlier stage's output is its input; `None` is the batch itself.
+    pub source: Option<usize>,
+}
+
+/// How a stage runs.
+#[derive(Clone, Debug)]
+pub(super) enum Kind {
+    /// A single layer, as it is.
+    Layer,
+    NormRectify(NormRectify),
+    PooledConv(Box<PooledConv>),
+}
+
+impl Stage {
+    /// The barrier of a stage that needs one: frozen layers go by their running statistics.
+    pub fn barrier<'a>(&'a self, network: &'a Network) -> Option<&'a dyn BatchStatistics> {
+        self.batch_statistics(network).filter(|_| !network.layers()[self.layers.start].frozen)
+    }
+
+    /// The statistics of batch normalisation, frozen or not.
+    pub fn batch_statistics<'a>(&'a self, network: &'a Network) -> Option<&'a dyn BatchStatistics> {
+        match &self.kind {
+            Kind::Layer => network.layers()[self.layers.start].layer.batch_statistics(),
+            Kind::NormRectify(fused) => Some(fused.batch_statistics()),
+            Kind::PooledConv(_) => None,
+        }
+    }
+
+    /// Whether training changes any of its parameters.
+    pub fn learns(&self, network: &Network) -> bool {
+        network.layers()[self.layers.clone()].iter().any(|layer| !layer.params.is_empty() && !layer.frozen)
+    }
+
+    /// Where its parameters lie.
+    pub fn params(&self, network: &Network) -> Range<usize> {
+        network.layers()[self.layers.start].params.start..network.layers()[self.layers.end - 1].params.end
+    }
+
+    pub fn input_len(&self, network: &Network) -> usize {
+        network.layers()[self.layers.start].layer.input().len()
+    }
+
+    pub fn output_len(&self, network: &Network) -> usize {
+        network.layers()[self.layers.end - 1].layer.output().len()
+    }
+
+    /// How many numbers of scratch its passes need for `n` images.
+    pub fn scratch_len(&self, network: &Network, n: usize) -> usize {
+        match &self.kind {
+            Kind::Layer => network.layers()[self.layers.start].layer.scratch_len(n),
+            Kind::NormRectify(fused) => fused.scratch_len(),
+            Kind::PooledConv(fused) => fused.scratch_len(n),
+        }
+    }
+
+    /// Its passes with prepared parameters, if it has those.
+    pub fn prepared<'a>(&'a self, network: &'a Network) -> Option<&'a dyn Prepared> {
+        match &self.kind {
+            Kind::Layer => network.layers()[self.layers.start].layer.prepared(),
+            Kind::NormRectify(_) => None,
+            Kind::PooledConv(fused) => Some(&**fused),
+        }
+    }
+
+    /// How many places of largest values an image has.
+    pub fn places_len(&self, network: &Network) -> usize {
+        if let Kind::PooledConv(_) = self.kind { self.output_len(network) } else { 0 }
+    }
+
+    /// Whether the gradient of its output may take the place of its output.
+    pub fn forgets_output(&self, network: &Network) -> bool {
+        match &self.kind {
+            Kind::Layer => network.layers()[self.layers.start].layer.linear().is_some(),
+            Kind::NormRectify(_) => true,
+            Kind::PooledConv(_) => false,
+        }
+    }
+}
+
+/// The stages of a network, in order; views are left out.
+pub(super) fn stages(network: &Network) -> Vec<Stage> {
+    let layers = network.layers();
+    let mut stages: Vec<Stage> = Vec::new();
+    let mut next = 0;
+    while next < layers.len() {
+        let source = stages.len().checked_sub(1);
+        if layers[next].layer.is_view() {
+            next += 1;
+            continue;
+        }
+        let after_linear =
+            source.is_some_and(|at| matches!(stages[at].kind, Kind::Layer) && stages[at].forgets_output(network));
+        let fused = match norm_rectify(network, &layers[next..]) {
+            Some((count, fused)) if after_linear => Some((count, Kind::NormRectify(fused))),
+            _ => pooled_conv(network, &layers[next..]).map(|fused| (3, Kind::PooledConv(Box::new(fused)))),
+        };
+        let (count, kind) = fused.unwrap_or((1, Kind::Layer));
+        stages.push(Stage { layers: next..next + count, kind, source });
+        next += count;
+    }
+    stages
+}
+
+/// Whether the gradient of the stage's input takes the place of that input.
+pub(super) fn replaces_input(network: &Network, stages: &[Stage], index: usize) -> bool {
+    let Some(source) = stages[index].source else { return false };
+    match &stages[index].kind {
+        Kind::NormRectify(_) => true,
+        Kind::PooledConv(_) => false,
+        Kind::Layer => {
+            let layer = &network.layers()[stages[index].layers.start].layer;
+            layer.linear().is_some() && stages[source].forgets_output(network)
+        }
+    }
+}
+
+/// The layers at the start of `layers` that a [`NormRectify`] stands for, and how many they are.
+fn norm_rectify(network: &Network, layers: &[NamedLayer]) -> Option<(usize, NormRectify)> {
+    let LayerSpec::BatchNorm { epsilon, running_old_weight } = layers.first()?.spec else { return None };
+    // It takes the gradients of its slopes at the barrier, which frozen batch norm has not.
+    if layers[0].frozen {
+        return None;
+    }
+    let slopes = match layers.get(1)?.spec {
+        LayerSpec::Relu {} => None,
+        LayerSpec::PRelu { slopes, .. } => Some(slopes),
+        _ => return None,
+    };
+    let pooled = match layers.get(2).map(|layer| &layer.spec) {
+        Some(LayerSpec::MaxPool { window: [2, 2], stride }) => stride.is_none_or(|stride| stride == [2, 2]),
+        _ => false,
+    };
+    let shape = layers[0].layer.input();
+    // Units of a dense layer are channels of one position, which planes are no help for; a slope each is a slope a channel.
+    let slopes = slopes.map(|slopes| if shape.positions() == 1 { Slopes::PerChannel } else { slopes });
+    let norm = BatchNorm::new(shape, epsilon, running_old_weight, network.isa()).ok()?;
+    Some((if pooled { 3 } else { 2 }, NormRectify::new(norm, slopes, pooled, network.isa())))
+}
+
+/// What stands for the first three of `layers`, if a [`PooledConv`] does.
+fn pooled_conv(network: &Network, layers: &[NamedLayer]) -> Option<PooledConv> {
+    let [conv, activation, pool, ..] = layers else { return None };
+    let LayerSpec::Conv2d { filters, kernel, stride, padding, init } = conv.spec else { return None };
+    let activation = match activation.spec {
+        LayerSpec::Relu {} => Rising::Relu,
+        LayerSpec::Elu { alpha } => Rising::Elu(alpha),
+        _ => return None,
+    };
+    let LayerSpec::MaxPool { window: [4, 4], stride: None | Some([4, 4]) } = pool.spec else { return None };
+    let isa = network.isa();
+    let conv = Conv2d::new(conv.layer.input(), filters, kernel, stride, padding, init, isa).ok()?;
+    PooledConv::new(conv, activation, isa)
+}
+
+#[cfg(test)]
+mod tests {
+    use steersman_kernels::Isa;
+
+    use super::super::training::{GROUP_LIMITS, GroupLimits};
+    use super::super::{Parameters, StepInput, TrainingPlan};
+    use super::*;
+    use crate::engine::loss::Loss;
+    use crate::engine::random::{Purpose, rng, uniform};
+    use crate::engine::tensor::Shape;
+
+    #[derive(serde::Deserialize)]
+    struct Layers {
+        layers: Vec<LayerSpec>,
+    }
+
+    fn layer_by_layer(network: &Network) -> Vec<Stage> {
+        let computes = (0..network.layers().len()).filter(|&layer| !network.layers()[layer].layer.is_view());
+        let stage = |(index, layer): (usize, usize)| Stage {
+            layers: layer..layer + 1,
+            kind: Kind::Layer,
+            source: index.checked_sub(1),
+        };
+        computes.enumerate().map(stage).collect()
+    }
+
+    /// Loss, gradient and parameters after a step.
+    fn step(network: &Network, stages: Vec<Stage>, images: usize, limits: GroupLimits) -> (f64, Vec<f32>, Parameters) {
+        let mut random = rng(3, Purpose::Test, 0, 0);
+        let mut draw = |len: usize| (0..len).map(|_| uniform(&mut random, -1.0, 1.0) as f32).collect::<Vec<f32>>();
+        let (x, labels) = (draw(images * network.input().len()), draw(images));
+        let mut parameters = network.initialize(1);
+        // Off their first values, so that slopes are not 0 and scales not 1.
+        parameters.values.iter_mut().zip(draw(network.count(true))).for_each(|(p, d)| *p += 0.2 * d);
+        parameters.statistics.iter_mut().zip(draw(network.count(false))).for_each(|(p, d)| *p += 0.2 * d);
+        let mut plan = TrainingPlan::with_stages(network, images, stages, limits);
+        let input = StepInput { x: &x, labels: &labels, seed: 1, step: 0 };
+        let loss = plan.step(network, &mut parameters, &Loss::default(), input);
+        (loss, plan.gradient().to_vec(), parameters)
+    }
+
+    #[test]
+    fn stages_compute_what_their_layers_do() {
+        let conv = "{ kind = 'conv2d', filters = 5, kernel = [3, 3] }";
+        let cases = [
+            (
+                2,
+                format!(
+                    "{conv}, {{ kind = 'batch_norm' }}, {{ kind = 'relu' }}, {conv}, {{ kind = 'batch_norm' }}, {{ kind = 'prelu' }}, {{ kind = 'max_pool', window = [2, 2] }}, {{ kind = 'flatten' }}, {{ kind = 'dense', units = 1 }}"
+                ),
+            ),
+            (
+                2,
+                format!(
+                    "{conv}, {{ kind = 'batch_norm' }}, {{ kind = 'prelu', slopes = 'per_channel' }}, {{ kind = 'max_pool', window = [2, 2] }}, {{ kind = 'dropout', drop_probability = 0.3 }}, {{ kind = 'dense', units = 7 }}, {{ kind = 'batch_norm' }}, {{ kind = 'prelu' }}, {{ kind = 'dense', units = 1 }}"
+                ),
+            ),
+            (
+                2,
+                format!(
+                    "{conv}, {{ kind = 'elu' }}, {{ kind = 'max_pool', window = [4, 4] }}, {conv}, {{ kind = 'relu' }}, {{ kind = 'max_pool', window = [4, 4] }}, {{ kind = 'dense', units = 1 }}"
+                ),
+            ),
+            (
+                1,
+                format!(
+                    "{{ kind = 'batch_norm' }}, {{ kind = 'relu' }}, {conv}, {{ kind = 'batch_norm' }}, {{ kind = 'relu' }}, {{ kind = 'max_pool', window = [3, 3] }}, {{ kind = 'dense', units = 1 }}"
+                ),
+            ),
+        ];
+        for (fused, layers) in cases {
+            let specs = toml::from_str::<Layers>(&format!("layers = [{layers}]")).unwrap().layers;
+            for isa in Isa::available() {
+                let fresh = || Network::new(Shape::new(2, 29, 31), &specs, isa).unwrap();
+                let network = fresh();
+                assert_eq!(stages(&network).iter().filter(|stage| stage.layers.len() > 1).count(), fused, "{layers}");
+                agrees(&network, &format!("{layers} on {}", isa.name()));
+                agrees_in_groups(&network, &format!("{layers} in groups on {}", isa.name()));
+                for frozen in [&["conv1"][..], &["bn1"], &["conv1", "bn1"], &["conv2"]] {
+                    let names: Vec<String> = frozen.iter().map(|name| name.to_string()).collect();
+                    let mut network = fresh();
+                    if names.iter().all(|name| network.layers().iter().any(|layer| layer.name == *name)) {
+                        network.freeze(&names).unwrap();
+                        agrees(&network, &format!("{layers} with {frozen:?} frozen on {}", isa.name()));
+                    }
+                }
+            }
+        }
+    }
+
+    /// The stages of `network` make the same step as its layers one by one.
+    fn agrees(network: &Network, what: &str) {
+        let stages_step = step(network, stages(network), 19, GROUP_LIMITS);
+        same(network, what, stages_step, step(network, layer_by_layer(network), 19, GROUP_LIMITS));
+    }
+
+    /// Shards of 5 images make the same step with 1 or 2 images at a time as with all.
+    fn agrees_in_groups(network: &Network, what: &str) {
+        let all = GroupLimits { segment_numbers: usize::MAX, group_numbers: usize::MAX, min_group: 5 };
+        let whole = step(network, stages(network), 80, all);
+        for images in [1, 2] {
+            let numbers = |limit: usize| images * limit;
+            let widest = stages(network).iter().map(|stage| stage.input_len(network) + stage.output_len(network)).max();
+            let limits =
+                GroupLimits { segment_numbers: numbers(widest.unwrap_or(1)), group_numbers: 1, min_group: images };
+            same(network, what, step(network, stages(network), 80, limits), whole.clone());
+        }
+    }
+
+    type Step = (f64, Vec<f32>, Parameters);
+
+    fn same(network: &Network, what: &str, step: Step, plain: Step) {
+        let (loss, gradient, parameters) = step;
+        let (plain_loss, plain_gradient, plain_parameters) = plain;
+        approx::assert_relative_eq!(loss, plain_loss, max_relative = 1e-5);
+        let squares = |range: Range<usize>| plain_gradient[range].iter().map(|g| g * g).sum::<f32>();
+        for tensor in network.tensors().iter().filter(|tensor| tensor.trainable && !tensor.frozen) {
+            let pairs = gradient[tensor.range.clone()].iter().zip(&plain_gradient[tensor.range.clone()]);
+            let distance: f32 = pairs.map(|(a, b)| (a - b).powi(2)).sum();
+            // Batch norm takes the mean away, so a bias before it has no gradient but rounding.
+            let size = squares(tensor.range.clone()).max(1e-6 * squares(0..plain_gradient.len()));
+            let error = (distance / size).sqrt();
+            assert!(error < 2e-4, "{}: {error:e} in {what}", tensor.name);
+        }
+        let statistics = parameters.statistics.iter().zip(&plain_parameters.statistics);
+        statistics.for_each(|(a, b)| approx::assert_relative_eq!(*a, *b, max_relative = 1e-5, epsilon = 1e-6));
+    }
+}

@@ -1,0 +1,428 @@
+//! A training step: forward, loss, backward, over fixed shards of the batch.
+//!
+//! The batch is cut into at most [`MAX_SHARDS`] shards whose borders depend on the batch size alone. Each shard has
+//! activations, a gradient arena and scratch of its own, and is worked on by one thread; gradients and batch-norm sums are
+//! added in the order of the shards. So the result has the same bits for any number of threads.
+//!
+//! Between two batch-norm barriers a shard takes a few images at a time through all layers, so that what one layer writes is
+//! still in the cache when the next reads it. A network without batch norm has no barrier at all: then a shard takes them
+//! forward *and* backward, and needs buffers for no more of them.
+
+use std::ops::Range;
+
+use rayon::prelude::*;
+use steersman_kernels::{Isa, update};
+
+use super::passes::Run;
+use super::shard::{Buffers, Shard, Spare, groups, total};
+use super::stages::{Stage, replaces_input, stages};
+use super::step_profile::{StageTime, StepTimes};
+use super::{Network, Parameters};
+use crate::engine::layers::BatchStatistics;
+use crate::engine::loss::Loss;
+use crate::engine::stopwatch::Stopwatch;
+
+/// Most shards a batch is cut into: enough to keep 16 threads busy.
+pub const MAX_SHARDS: usize = 16;
+
+/// How many images a shard takes at a time.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct GroupLimits {
+    /// What goes in and out between two barriers, in numbers.
+    pub segment_numbers: usize,
+    /// All activations, in numbers, in networks without a barrier.
+    pub group_numbers: usize,
+    /// Fewest images in networks without a barrier, if the shard has as many.
+    pub min_group: usize,
+}
+
+/// About 2 MiB between barriers: less would fit the second-level cache, but the weight gradient wants several images of a small map
+/// in a call. About 1 MiB without barriers, but 8 images, because the weight gradient has a cost for each call.
+pub(super) const GROUP_LIMITS: GroupLimits =
+    GroupLimits { segment_numbers: 512 * 1024, group_numbers: 256 * 1024, min_group: 8 };
+
+/// Parameters that are reduced and updated as one task.
+pub const CHUNK: usize = 4096;
+
+/// The batch of one training step.
+#[derive(Clone, Copy, Debug)]
+pub struct StepInput<'a> {
+    /// Images, `[n][c][h][w]`.
+    pub x: &'a [f32],
+    /// What the network should say, `[n][outputs]`.
+    pub labels: &'a [f32],
+    /// Seed of the run (for dropout).
+    pub seed: u64,
+    /// Number of the step, from 0 (for dropout).
+    pub step: u64,
+}
+
+/// The buffers of a training step, planned once for a network and a largest batch.
+#[derive(Debug)]
+pub struct TrainingPlan {
+    shards: Vec<Shard>,
+    /// The buffers that no shard is using, in networks without a barrier.
+    spare_buffers: Spare<Buffers>,
+    /// The scratch that no shard is using.
+    spare_scratch: Spare<Vec<f32>>,
+    /// Gradient of the mean loss with respect to [`Parameters::values`].
+    gradient: Vec<f32>,
+    /// Sum of squares of each chunk of the gradient.
+    chunk_squares: Vec<f64>,
+    stages: Vec<Stage>,
+    /// The parameters of each stage as its passes read them, made anew in every step.
+    prepared: Vec<Vec<f32>>,
+    /// What the barriers found out about the batch, all stages one after the other.
+    moments: Vec<f32>,
+    /// Where each stage's part of `moments` lies.
+    moments_of: Vec<Range<usize>>,
+    sums: Vec<f64>,
+    /// Runs of stages without a barrier inside; each but the first begins with the stage that needs the barrier.
+    segments: Vec<Range<usize>>,
+    /// How many images go through each segment at a time.
+    segment_groups: Vec<usize>,
+    /// The first stage that learns: below it nobody asks for a gradient.
+    first_learning: usize,
+    capacity: usize,
+    isa: Isa,
+    times: StepTimes,
+}
+
+impl TrainingPlan {
+    /// Buffers for batches of up to `capacity` images.
+    pub fn new(network: &Network, capacity: usize) -> TrainingPlan {
+        TrainingPlan::with_stages(network, capacity, stages(network), GROUP_LIMITS)
+    }
+
+    pub(super) fn with_stages(
+        network: &Network,
+        capacity: usize,
+        stages: Vec<Stage>,
+        limits: GroupLimits,
+    ) -> TrainingPlan {
+        let mut moments_of = Vec::new();
+        let mut segment_starts = vec![0];
+        let (mut moments_end, mut sums_len) = (0, 0);
+        for (index, stage) in stages.iter().enumerate() {
+            let barrier = stage.barrier(network);
+            let len = stage.batch_statistics(network).map_or(0, BatchStatistics::moments_len);
+            moments_of.push(moments_end..moments_end + len);
+            moments_end += len;
+            if let Some(barrier) = barrier {
+                sums_len = sums_len.max(barrier.sums_len());
+                segment_starts.push(index);
+            }
+        }
+        // A network that begins with a barrier has an empty first segment, which only takes the sums of the input.
+        let ends = segment_starts[1..].iter().copied().chain([stages.len()]);
+        let segments: Vec<_> = segment_starts.iter().copied().zip(ends).map(|(start, end)| start..end).collect();
+
+        let per_image: usize = stages.iter().map(|stage| stage.output_len(network)).sum();
+        // What is not put in the place of an activation: the gradient of the last output, and of the inputs of the others.
+        let gradients = stages.iter().enumerate().filter(|(index, _)| !replaces_input(network, &stages, *index));
+        let largest = gradients.map(|(_, stage)| stage.input_len(network)).chain([network.output().len()]).max();
+        let largest = largest.unwrap_or(0);
+
+        let shard_capacity = capacity.div_ceil(MAX_SHARDS).max(1);
+        let group = if segments.len() > 1 {
+            shard_capacity
+        } else {
+            (limits.group_numbers / per_image.max(1)).clamp(limits.min_group.min(shard_capacity), shard_capacity)
+        };
+        let segment_groups = (0..segments.len())
+            .map(|segment| segment_group(network, &stages, &segments, segment, limits).unwrap_or(shard_capacity))
+            .map(|images| images.min(shard_capacity))
+            .collect();
+        let scratch_len = stages.iter().map(|stage| stage.scratch_len(network, group)).max().unwrap_or(0);
+        let mut spare: Vec<Buffers> = (0..capacity.min(MAX_SHARDS))
+            .map(|_| Buffers {
+                activations: stages.iter().map(|stage| vec![0.0; group * stage.output_len(network)]).collect(),
+                places: stages.iter().map(|stage| vec![0; stage.places_len(network) * group]).collect(),
+                d_output: vec![0.0; group * largest],
+                d_input: vec![0.0; group * largest],
+                in_place: false,
+            })
+            .collect();
+        let shards = (0..capacity.min(MAX_SHARDS))
+            .map(|_| Shard {
+                images: 0..0,
+                buffers: if segments.len() > 1 { spare.pop().unwrap_or_default() } else { Buffers::default() },
+                scratch: Vec::new(),
+                gradient: vec![0.0; network.count(true)],
+                first: 0,
+                sums: vec![0.0; sums_len],
+                group_sums: vec![0.0; sums_len],
+                loss: 0.0,
+            })
+            .collect();
+        TrainingPlan {
+            shards,
+            spare_buffers: Spare::new(spare),
+            spare_scratch: Spare::new((0..capacity.min(MAX_SHARDS)).map(|_| vec![0.0; scratch_len]).collect()),
+            gradient: vec![0.0; network.count(true)],
+            chunk_squares: vec![0.0; network.count(true).div_ceil(CHUNK)],
+            first_learning: stages.iter().position(|stage| stage.learns(network)).unwrap_or(stages.len()),
+            times: StepTimes::off(stages.len()),
+            prepared: stages
+                .iter()
+                .map(|stage| stage.prepared(network).map_or(0, |prepared| prepared.prepared_for_training_len()))
+                .map(|len| vec![0.0; len])
+                .collect(),
+            stages,
+            moments: vec![0.0; moments_end],
+            moments_of,
+            sums: vec![0.0; sums_len],
+            segments,
+            segment_groups,
+            capacity,
+            isa: network.isa(),
+        }
+    }
+
+    /// Gradient of the mean loss of the last step with respect to [`Parameters::values`].
+    pub fn gradient(&self) -> &[f32] {
+        &self.gradient
+    }
+
+    /// The gradient, to be clipped in place.
+    pub fn gradient_mut(&mut self) -> &mut [f32] {
+        &mut self.gradient
+    }
+
+    /// L2 norm of the gradient, as it was after the last step.
+    pub fn gradient_norm(&self) -> f64 {
+        self.chunk_squares.iter().sum::<f64>().sqrt()
+    }
+
+    /// Measures from now on how long each stage takes; `reduce` gets the time for adding the shards' gradients up.
+    pub fn measure(&mut self, reduce: Stopwatch) {
+        self.times = StepTimes::on(self.stages.len(), reduce);
+    }
+
+    /// What [`measure`](TrainingPlan::measure) has found so far, in the order of the layers.
+    pub fn stage_times(&self, network: &Network) -> Vec<StageTime> {
+        StageTime::of(network, &self.stages, &self.times, self.first_learning)
+    }
+
+    /// Computes the mean loss of the batch and leaves its gradient in [`gradient`](TrainingPlan::gradient). Of the
+    /// parameters only the running statistics change. Allocates nothing when called inside a rayon pool.
+    ///
+    /// # Panics
+    ///
+    /// Panics if `network` is not the one the plan was made for, or the batch is empty or larger than planned.
+    pub fn step(&mut self, network: &Network, parameters: &mut Parameters, loss: &Loss, input: StepInput) -> f64 {
+        let n = input.x.len() / network.input().len();
+        assert!(n > 0 && n <= self.capacity, "a batch of {n} images in a plan for 1 to {}", self.capacity);
+        assert_eq!(input.x.len(), n * network.input().len());
+        assert_eq!(input.labels.len(), n * network.output().len());
+        let planned = self.stages.last().map_or(0, |stage| stage.layers.end);
+        assert!(network.layers()[planned..].iter().all(|layer| layer.layer.is_view()), "a plan for another network");
+
+        let shard_images = n.div_ceil(MAX_SHARDS);
+        let used = n.div_ceil(shard_images);
+        for (index, shard) in self.shards[..used].iter_mut().enumerate() {
+            shard.images = index * shard_images..((index + 1) * shard_images).min(n);
+        }
+        self.freeze_moments(network, parameters);
+        self.prepare(network, parameters);
+        if self.segments.len() == 1 {
+            self.step_without_barriers(network, parameters, loss, input, used);
+        } else {
+            self.step_with_barriers(network, parameters, loss, input, used);
+        }
+        self.reduce_gradient(network, used);
+        self.shards[..used].iter().map(|shard| shard.loss).sum::<f64>() / input.labels.len() as f64
+    }
+
+    /// Puts the parameters in the order in which the passes read them, once for all shards.
+    fn prepare(&mut self, network: &Network, parameters: &Parameters) {
+        self.prepared.par_iter_mut().zip(&self.stages).for_each(|(to, stage)| {
+            if let Some(prepared) = stage.prepared(network) {
+                prepared.prepare_for_training(&parameters.values[stage.params(network)], to);
+            }
+        });
+    }
+
+    /// The moments of frozen batch normalisation.
+    fn freeze_moments(&mut self, network: &Network, parameters: &Parameters) {
+        for (stage, moments_of) in self.stages.iter().zip(&self.moments_of) {
+            let layer = &network.layers()[stage.layers.start];
+            if let Some(statistics) = stage.batch_statistics(network).filter(|_| layer.frozen) {
+                let params = &parameters.values[layer.params.clone()];
+                let running = &parameters.statistics[layer.statistics.clone()];
+                statistics.frozen_moments(params, running, &mut self.moments[moments_of.clone()]);
+            }
+        }
+    }
+
+    fn step_without_barriers(
+        &mut self,
+        network: &Network,
+        parameters: &Parameters,
+        loss: &Loss,
+        input: StepInput,
+        used: usize,
+    ) {
+        let TrainingPlan {
+            shards,
+            spare_buffers,
+            spare_scratch,
+            stages,
+            prepared,
+            moments,
+            moments_of,
+            first_learning,
+            times,
+            ..
+        } = self;
+        let first_learning = *first_learning;
+        let run = Run { network, parameters, stages, prepared, moments, moments_of, first_learning, input, times };
+        shards[..used].par_iter_mut().for_each(|shard| {
+            shard.reset();
+            shard.buffers = spare_buffers.take();
+            shard.scratch = spare_scratch.take();
+            let group = shard.group_capacity(network);
+            for images in groups(shard.images.clone(), group) {
+                shard.first = images.start;
+                run.forward(0..stages.len(), shard, images.clone());
+                run.loss(loss, shard, images.clone());
+                run.backward(0..stages.len(), shard, images);
+            }
+            spare_buffers.put(std::mem::take(&mut shard.buffers));
+            spare_scratch.put(std::mem::take(&mut shard.scratch));
+        });
+    }
+
+    fn step_with_barriers(
+        &mut self,
+        network: &Network,
+        parameters: &mut Parameters,
+        loss: &Loss,
+        input: StepInput,
+        used: usize,
+    ) {
+        let TrainingPlan {
+            shards,
+            spare_scratch,
+            stages,
+            prepared,
+            moments,
+            moments_of,
+            sums,
+            segments,
+            segment_groups,
+            first_learning,
+            times,
+            ..
+        } = self;
+        let first_learning = *first_learning;
+        let shards = &mut shards[..used];
+        let images = shards.last().map_or(0, |shard| shard.images.end);
+        let barrier = |stage: usize| {
+            stages[stage].barrier(network).expect("segments begin with a stage that has batch statistics")
+        };
+        let last = segments.len() - 1;
+
+        for (index, segment) in segments.iter().enumerate() {
+            let run = Run { network, parameters, stages, prepared, moments, moments_of, first_learning, input, times };
+            let next_barrier = segments.get(index + 1).map(|next| next.start);
+            shards.par_iter_mut().for_each(|shard| {
+                if index == 0 {
+                    shard.reset();
+                }
+                shard.begin_segment(spare_scratch);
+                for images in groups(shard.images.clone(), segment_groups[index]) {
+                    run.forward(segment.clone(), shard, images.clone());
+                    if let Some(stage) = next_barrier {
+                        run.forward_sums(stage, barrier(stage), shard, images);
+                    }
+                }
+                if next_barrier.is_none() {
+                    run.loss(loss, shard, shard.images.clone());
+                }
+                spare_scratch.put(std::mem::take(&mut shard.scratch));
+            });
+            if let Some(stage) = next_barrier {
+                let layer = &network.layers()[stages[stage].layers.start];
+                let sums = total(shards, barrier(stage).sums_len(), sums);
+                barrier(stage).finish_forward(
+                    &parameters.values[layer.params.clone()],
+                    images,
+                    sums,
+                    &mut moments[moments_of[stage].clone()],
+                    &mut parameters.statistics[layer.statistics.clone()],
+                );
+            }
+        }
+        for (index, segment) in segments.iter().enumerate().rev() {
+            let run = Run { network, parameters, stages, prepared, moments, moments_of, first_learning, input, times };
+            // The stage at the start of a segment waits for the sums over all shards.
+            let rest = if index > 0 { segment.start + 1..segment.end } else { segment.clone() };
+            shards.par_iter_mut().for_each(|shard| {
+                shard.begin_segment(spare_scratch);
+                let in_place = shard.buffers.in_place;
+                for images in groups(shard.images.clone(), segment_groups[index]) {
+                    shard.buffers.in_place = in_place;
+                    if index < last {
+                        let next = segments[index + 1].start;
+                        run.backward(next..next + 1, shard, images.clone());
+                    }
+                    run.backward(rest.clone(), shard, images.clone());
+                    if index > 0 {
+                        run.backward_sums(segment.start, barrier(segment.start), shard, images);
+                    }
+                }
+                spare_scratch.put(std::mem::take(&mut shard.scratch));
+            });
+            if index > 0 {
+                let stage = segment.start;
+                let sums = total(shards, barrier(stage).sums_len(), sums);
+                let params = &parameters.values[network.layers()[stages[stage].layers.start].params.clone()];
+                let moments = &mut moments[moments_of[stage].clone()];
+                barrier(stage).finish_backward(params, images, sums, moments);
+            }
+        }
+    }
+
+    /// Adds the shards' gradients up, in their order. Those of frozen layers count as 0.
+    fn reduce_gradient(&mut self, network: &Network, used: usize) {
+        let TrainingPlan { shards, gradient, chunk_squares, isa, times, .. } = self;
+        let shards = &shards[..used];
+        gradient.par_chunks_mut(CHUNK).zip(chunk_squares.par_iter_mut()).enumerate().for_each(
+            |(index, (chunk, squares))| {
+                times.reduce.time(|| {
+                    let range = index * CHUNK..index * CHUNK + chunk.len();
+                    chunk.copy_from_slice(&shards[0].gradient[range.clone()]);
+                    for shard in &shards[1..] {
+                        update::sum_into(*isa, chunk, &shard.gradient[range.clone()]);
+                    }
+                    for layer in network.layers().iter().filter(|layer| layer.frozen) {
+                        let (from, to) = (layer.params.start.max(range.start), layer.params.end.min(range.end));
+                        if from < to {
+                            chunk[from - range.start..to - range.start].fill(0.0);
+                        }
+                    }
+                    *squares = update::sum_of_squares(*isa, chunk);
+                })
+            },
+        );
+    }
+}
+
+/// How many images should go through a segment at a time: `None` where they cannot be told apart, because a gradient on the way
+/// back leaves its place among the activations.
+fn segment_group(
+    network: &Network,
+    stages: &[Stage],
+    segments: &[Range<usize>],
+    segment: usize,
+    limits: GroupLimits,
+) -> Option<usize> {
+    let stays = |index: usize| stages[index].source.is_none() || replaces_input(network, stages, index);
+    let next = segments.get(segment + 1)?.start;
+    let after_next = next + 1 < stages.len() && replaces_input(network, stages, next + 1);
+    let all_stay = (segments[segment].start + 1..=next).all(stays);
+    let stages = &stages[segments[segment].clone()];
+    let numbers: usize = stages.iter().map(|stage| stage.input_len(network).max(stage.output_len(network))).sum();
+    (after_next && all_stay).then_some((limits.segment_numbers / numbers.max(1)).max(1))
+}

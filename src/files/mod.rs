@@ -1,0 +1,4 @@
+//! Files and folders that appear whole or not at all.
+
+pub mod atomic_file;
+pub mod new_folder;

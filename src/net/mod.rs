@@ -1,0 +1,3 @@
+//! What the two servers, [`serve`](crate::serve) and [`live`](crate::live), share.
+
+pub(crate) mod http;

@@ -1,0 +1,74 @@
+//! JPEG as Udacity's simulator writes it: quality 75, colour at half resolution (4:2:0).
+
+use jpeg_encoder::{ColorType, Encoder, SamplingFactor};
+use zune_jpeg::JpegDecoder;
+use zune_jpeg::zune_core::bytestream::ZCursor;
+
+use crate::simulator::camera::pinhole::{HEIGHT, RgbFrame, WIDTH};
+use crate::{Error, Result};
+
+/// Quality of the pictures.
+pub const QUALITY: u8 = 75;
+
+/// Appends the JPEG of `frame` to `out`.
+///
+/// # Errors
+/// If the frame has not 320x160 pixels.
+pub fn encode(frame: &RgbFrame, out: &mut Vec<u8>) -> Result<()> {
+    let mut encoder = Encoder::new(out, QUALITY);
+    encoder.set_sampling_factor(SamplingFactor::F_2_2);
+    encoder
+        .encode(&frame.pixels, WIDTH as u16, HEIGHT as u16, ColorType::Rgb)
+        .map_err(|e| Error::Usage(format!("a picture could not be encoded as JPEG: {e}")))
+}
+
+/// Decodes a JPEG of 320x160 pixels into `frame`.
+///
+/// # Errors
+/// If the bytes are no JPEG of that size.
+pub fn decode(bytes: &[u8], frame: &mut RgbFrame) -> Result<()> {
+    let fail = |e: &dyn std::fmt::Display| Error::Usage(format!("a JPEG could not be decoded: {e}"));
+    frame.pixels.resize(WIDTH * HEIGHT * 3, 0);
+    JpegDecoder::new(ZCursor::new(bytes)).decode_into(&mut frame.pixels).map_err(|e| fail(&e))
+}
+
+/// A camera picture as it arrives at a driver: encoded and decoded. Keeps its buffer.
+#[derive(Default)]
+pub struct RoundTrip {
+    bytes: Vec<u8>,
+}
+
+impl RoundTrip {
+    /// Replaces `frame` by what is left of it after JPEG.
+    ///
+    /// # Errors
+    /// As [`encode`] and [`decode`].
+    pub fn apply(&mut self, frame: &mut RgbFrame) -> Result<()> {
+        self.bytes.clear();
+        encode(frame, &mut self.bytes)?;
+        decode(&self.bytes, frame)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_round_trip_changes_a_smooth_picture_little_and_keeps_its_colours() {
+        let mut frame = RgbFrame::default();
+        for (at, pixel) in frame.pixels.chunks_exact_mut(3).enumerate() {
+            let (x, y) = (at % WIDTH, at / WIDTH);
+            pixel.copy_from_slice(&[(x / 2) as u8, 90, (y + 40) as u8]);
+        }
+        let before = frame.clone();
+        RoundTrip::default().apply(&mut frame).unwrap();
+        let worst = frame.pixels.iter().zip(&before.pixels).map(|(a, b)| a.abs_diff(*b)).max().unwrap();
+        assert!(frame != before && worst <= 8, "{worst}");
+    }
+
+    #[test]
+    fn something_else_is_refused() {
+        assert!(decode(b"no picture", &mut RgbFrame::default()).is_err());
+    }
+}

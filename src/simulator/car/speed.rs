@@ -1,0 +1,169 @@
+//! Holding a speed: the controller of Udacity's `drive.py`, in elapsed time instead of frames.
+
+use crate::simulator::car::dynamics::{MAX_STEER_DEG, MPS_PER_MPH, WHEELBASE_M};
+use crate::simulator::car::simulation::Simulation;
+
+/// Throttle for each mph of error.
+const PROPORTIONAL: f64 = 0.1;
+/// Throttle for each mph of error and second; `drive.py` adds 0.002 a frame, which is this at 20 frames a second.
+const INTEGRAL_PER_S: f64 = 0.04;
+/// Time that the first frame stands for, s.
+const FIRST_FRAME_S: f64 = 0.05;
+/// Longest time that a frame stands for, s.
+const LONGEST_FRAME_S: f64 = 0.5;
+/// Sideways acceleration that `Speed::Auto` allows itself in bends, m/s².
+const COMFORT_MPS2: f64 = 2.5;
+
+/// Speed below which nobody slows down in bends, mph.
+const SLOWEST_MPH: f64 = 9.0;
+
+/// The speed a drive aims at.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Speed {
+    /// The same everywhere, mph.
+    Fixed(f64),
+    /// 30 mph, less before and in bends.
+    Auto,
+}
+
+impl Speed {
+    /// The speed to aim at here, mph.
+    pub fn target_mph(self, simulation: &Simulation) -> f64 {
+        match self {
+            Speed::Fixed(mph) => mph,
+            Speed::Auto => {
+                let sign = if simulation.reverse { -1.0 } else { 1.0 };
+                let sharpest = (0..=12)
+                    .map(|k| simulation.track.at(simulation.location.s_m + sign * f64::from(k) * 2.5).curvature.abs())
+                    .fold(0.0, f64::max);
+                comfortable_mph(sharpest).clamp(SLOWEST_MPH, 30.0)
+            }
+        }
+    }
+
+    /// The speed at which runs begin, m/s.
+    pub fn at_start_mps(self) -> f64 {
+        match self {
+            Speed::Fixed(mph) => mph * MPS_PER_MPH,
+            Speed::Auto => 12.0 * MPS_PER_MPH,
+        }
+    }
+}
+
+/// The speed of a comfortable bend, mph; `curvature` in 1/m, not negative.
+fn comfortable_mph(curvature: f64) -> f64 {
+    (COMFORT_MPS2 / curvature.max(1e-6)).sqrt() / MPS_PER_MPH
+}
+
+/// The speed to aim at where `steering`, [-1, 1], is needed and `target_mph` wanted: less in bends, for somebody who knows
+/// the bend only by the wheel.
+pub fn slower_in_bends_mph(target_mph: f64, steering: f64) -> f64 {
+    let curvature = (steering * MAX_STEER_DEG).to_radians().tan().abs() / WHEELBASE_M;
+    comfortable_mph(curvature).clamp(SLOWEST_MPH.min(target_mph), target_mph)
+}
+
+/// The speed as telemetry carries it: four decimals, mph.
+pub fn telemetry_mph(speed_mps: f64) -> f64 {
+    (speed_mps / MPS_PER_MPH * 1e4).round() / 1e4
+}
+
+/// A proportional-integral controller from speed to throttle.
+#[derive(Clone, Debug, Default)]
+pub struct SpeedController {
+    /// Sum of error times time, mph s.
+    integral: f64,
+    /// Time of the last frame, s.
+    last_s: Option<f64>,
+}
+
+impl SpeedController {
+    /// The throttle, [-1, 1], for the frame of time `time_s`, in the 32 bits that the car takes.
+    ///
+    /// The first frame counts for 0.05 s; a gap longer than 0.5 s for no more than that, and a
+    /// clock that ran backwards for nothing.
+    pub fn throttle_at(&mut self, time_s: f64, target_mph: f64, speed_mph: f64) -> f32 {
+        let dt_s = self.last_s.map_or(FIRST_FRAME_S, |last| (time_s - last).clamp(0.0, LONGEST_FRAME_S));
+        self.last_s = Some(time_s);
+        self.throttle(target_mph, speed_mph, dt_s) as f32
+    }
+
+    /// The throttle, [-1, 1], after `dt_s` more seconds at `speed_mph` where `target_mph` is wanted.
+    pub fn throttle(&mut self, target_mph: f64, speed_mph: f64, dt_s: f64) -> f64 {
+        let error = target_mph - speed_mph;
+        let integral = self.integral + error * dt_s;
+        let throttle = PROPORTIONAL * error + INTEGRAL_PER_S * integral;
+        // At full throttle or brake the sum must not grow further: it would only make the car overshoot.
+        if throttle.abs() <= 1.0 || throttle.signum() != error.signum() {
+            self.integral = integral;
+        }
+        throttle.clamp(-1.0, 1.0)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::simulator::car::dynamics::{Car, Controls, STEP_S};
+
+    #[test]
+    fn in_bends_the_speed_falls_to_a_comfortable_one_and_straight_ahead_it_does_not() {
+        assert_eq!(slower_in_bends_mph(20.0, 0.0), 20.0);
+        assert_eq!(slower_in_bends_mph(5.0, 1.0), 5.0);
+        assert_eq!(slower_in_bends_mph(30.0, -1.0), SLOWEST_MPH);
+        let mph = slower_in_bends_mph(30.0, 0.2);
+        let radius_m = WHEELBASE_M / 5_f64.to_radians().tan();
+        assert!(((mph * MPS_PER_MPH).powi(2) / radius_m - COMFORT_MPS2).abs() < 1e-9, "{mph}");
+    }
+
+    #[test]
+    fn a_long_start_at_full_throttle_does_not_make_the_car_overshoot() {
+        let mut car = Car::new(0.0, 0.0, 1.0, 0.0, 0.0);
+        let (mut controller, mut fastest_mph) = (SpeedController::default(), 0.0_f64);
+        for _ in 0..60 {
+            controller.throttle(20.0, 0.0, 1.0);
+        }
+        for _ in 0..1000 {
+            let speed_mph = car.speed_mps / MPS_PER_MPH;
+            let throttle = controller.throttle(20.0, speed_mph, STEP_S);
+            car.step(Controls { steering: 0.0, throttle }, 0.0, 0.0);
+            fastest_mph = fastest_mph.max(speed_mph);
+        }
+        assert!(fastest_mph < 22.0, "{fastest_mph}");
+    }
+
+    #[test]
+    fn the_speed_settles_at_the_target_from_rest_and_from_above_whatever_the_frame_rate() {
+        for (from_mph, every) in [(0.0, 1), (0.0, 5), (30.0, 2)] {
+            let mut car = Car::new(0.0, 0.0, 1.0, 0.0, from_mph * MPS_PER_MPH);
+            let (mut controller, mut throttle) = (SpeedController::default(), 0.0);
+            for step in 0..2000 {
+                if step % every == 0 {
+                    throttle = controller.throttle(20.0, car.speed_mps / MPS_PER_MPH, every as f64 * STEP_S);
+                }
+                car.step(Controls { steering: 0.0, throttle }, 0.0, 0.0);
+            }
+            assert!((car.speed_mps / MPS_PER_MPH - 20.0).abs() < 0.3, "{}", car.speed_mps / MPS_PER_MPH);
+        }
+    }
+
+    #[test]
+    fn time_stamps_count_as_elapsed_time_but_gaps_and_steps_back_are_limited() {
+        let throttle = |times: &[f64]| {
+            let mut controller = SpeedController::default();
+            times.iter().fold(0.0, |_, time_s| controller.throttle_at(*time_s, 20.0, 18.0))
+        };
+        let elapsed = |total_s: f64| SpeedController::default().throttle(20.0, 18.0, total_s) as f32;
+        assert!((throttle(&[7.0, 7.03, 7.1]) - elapsed(0.05 + 0.1)).abs() < 1e-6);
+        assert!((throttle(&[7.0, 90.0]) - elapsed(0.05 + 0.5)).abs() < 1e-6);
+        assert!((throttle(&[7.0, 3.0]) - elapsed(0.05)).abs() < 1e-6);
+    }
+
+    #[test]
+    fn telemetry_has_four_decimals_and_survives_printing() {
+        for mph in [0.0, 0.00004, 0.00005, 12.34565, 29.99999] {
+            let rounded = telemetry_mph(mph * MPS_PER_MPH);
+            assert!((rounded - mph).abs() <= 0.5001e-4);
+            assert_eq!(format!("{rounded:.4}").parse(), Ok(rounded));
+        }
+    }
+}

@@ -1,0 +1,173 @@
+//! The files of a recording: pictures, the log's lines, and a writer that adds one row after the other.
+
+use std::fs::{self, File};
+use std::io::{self, Write as _};
+use std::path::{Path, PathBuf};
+
+use crate::simulator::camera::jpeg;
+use crate::simulator::camera::pinhole::{BodyPose, Camera, Mount, RgbFrame};
+use crate::simulator::camera::renderer::Renderer;
+use crate::simulator::recorder::record::LogFormat;
+use crate::simulator::road::track::Track;
+use crate::simulator::scenery::light::Variant;
+use crate::simulator::scenery::world::World;
+use crate::{Error, Result};
+
+/// One row of the log before its pictures are taken.
+#[derive(Clone, Debug)]
+pub struct Sample {
+    /// Simulated time, s.
+    pub time_s: f64,
+    /// The car.
+    pub body: BodyPose,
+    /// Label: steering, [-1, 1], + = right.
+    pub steering: f64,
+    /// Throttle, 0 to 1.
+    pub throttle: f64,
+    /// Brake, 0 to 1.
+    pub brake: f64,
+    /// Speed, mph.
+    pub speed_mph: f64,
+}
+
+/// Takes the pictures of rows. Keeps its buffers.
+#[derive(Default)]
+pub(crate) struct Photographer {
+    renderer: Renderer,
+    frame: RgbFrame,
+    bytes: Vec<u8>,
+}
+
+impl Photographer {
+    /// Writes the pictures of all cameras into the folder `images`.
+    pub fn take(&mut self, world: &World, variant: &Variant, sample: &Sample, images: &Path) -> Result<()> {
+        for mount in Mount::ALL {
+            self.renderer.render(world, variant, &Camera::new(&sample.body, mount), mount, &mut self.frame);
+            self.bytes.clear();
+            jpeg::encode(&self.frame, &mut self.bytes)?;
+            let path = images.join(image_name(mount, sample.time_s));
+            fs::write(&path, &self.bytes).map_err(Error::io(&path))?;
+        }
+        Ok(())
+    }
+}
+
+/// Name of a picture taken `time_s` after noon of 1 January 2026, the simulator's fixed date.
+fn image_name(mount: Mount, time_s: f64) -> String {
+    let ms = (time_s * 1000.0).round() as u64 + 12 * 3_600_000;
+    let (day, ms) = (1 + ms / 86_400_000, ms % 86_400_000);
+    let (hour, minute, second) = (ms / 3_600_000, ms / 60_000 % 60, ms / 1000 % 60);
+    format!("{}_2026_01_{day:02}_{hour:02}_{minute:02}_{second:02}_{:03}.jpg", mount.name(), ms % 1000)
+}
+
+/// The lines of a log, in its format.
+pub(crate) struct LogLines {
+    format: LogFormat,
+    /// The folder of the pictures as the log names it.
+    images: PathBuf,
+}
+
+impl LogLines {
+    /// For a recording in the folder `out`.
+    pub fn new(format: LogFormat, out: &Path) -> Result<LogLines> {
+        let images = match format {
+            LogFormat::Sample => PathBuf::from("IMG"),
+            LogFormat::V2 => std::path::absolute(out).map_err(Error::io(out))?.join("IMG"),
+        };
+        Ok(LogLines { format, images })
+    }
+
+    /// What stands above the rows.
+    pub fn header(&self) -> &'static str {
+        match self.format {
+            LogFormat::Sample => "center,left,right,steering,throttle,brake,speed\n",
+            LogFormat::V2 => "",
+        }
+    }
+
+    /// Appends the line of `sample`.
+    pub fn row(&self, sample: &Sample, text: &mut Vec<u8>) -> io::Result<()> {
+        let separator = if self.format == LogFormat::Sample { ", " } else { "," };
+        for mount in Mount::ALL {
+            let name = image_name(mount, sample.time_s);
+            match self.format {
+                LogFormat::Sample => write!(text, "IMG/{name}{separator}")?,
+                LogFormat::V2 => write!(text, "{}{separator}", self.images.join(name).display())?,
+            }
+        }
+        let numbers =
+            [sample.steering, sample.throttle, sample.brake, sample.speed_mph].map(|v| (v as f32).to_string());
+        writeln!(text, "{}", numbers.join(separator))
+    }
+}
+
+/// Writes a recording while it is driven. A row is in the log only once its pictures are on the disk, so whatever happens,
+/// what was written can be read.
+pub struct RowWriter<'a> {
+    world: &'a World,
+    variant: Variant,
+    photographer: Photographer,
+    images: PathBuf,
+    lines: LogLines,
+    log: PathBuf,
+    file: File,
+    /// Bytes of whole lines.
+    len: u64,
+    text: Vec<u8>,
+}
+
+impl<'a> RowWriter<'a> {
+    /// Begins a recording on `track`, in the light that `seed` draws, in the existing folder `folder`, which will be called
+    /// `out`.
+    ///
+    /// # Errors
+    /// If the files cannot be created.
+    pub fn new(track: &'a Track, seed: u64, format: LogFormat, folder: &Path, out: &Path) -> Result<RowWriter<'a>> {
+        let images = folder.join("IMG");
+        fs::create_dir(&images).map_err(Error::io(&images))?;
+        let lines = LogLines::new(format, out)?;
+        let log = folder.join("driving_log.csv");
+        let mut file = File::create_new(&log).map_err(Error::io(&log))?;
+        file.write_all(lines.header().as_bytes()).map_err(Error::io(&log))?;
+        let world = track.world();
+        Ok(RowWriter {
+            world,
+            variant: Variant::new(world, seed),
+            photographer: Photographer::default(),
+            images,
+            len: lines.header().len() as u64,
+            lines,
+            log,
+            file,
+            text: Vec::new(),
+        })
+    }
+
+    /// Takes the pictures of `sample` and adds its line.
+    ///
+    /// # Errors
+    /// If something cannot be written. The rows before stay whole.
+    pub fn write(&mut self, sample: &Sample) -> Result<()> {
+        self.photographer.take(self.world, &self.variant, sample, &self.images)?;
+        self.text.clear();
+        let written = self.lines.row(sample, &mut self.text).and_then(|()| self.file.write_all(&self.text));
+        if let Err(source) = written {
+            // Half a line helps nobody. If it cannot be taken back either, readers count it as unusable.
+            let _ = self.file.set_len(self.len);
+            return Err(Error::Io { path: self.log.clone(), source });
+        }
+        self.len += self.text.len() as u64;
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_carry_simulated_time() {
+        assert_eq!(image_name(Mount::Left, 0.1), "left_2026_01_01_12_00_00_100.jpg");
+        assert_eq!(image_name(Mount::Center, 43_261.02), "center_2026_01_02_00_01_01_020.jpg");
+    }
+}

@@ -1,0 +1,8 @@
+//! What stands and lies beside the road, and the light on it.
+
+pub mod light;
+pub(crate) mod pictures;
+pub(crate) mod road_texture;
+pub(crate) mod sky;
+pub(crate) mod terrain;
+pub(crate) mod world;

@@ -1,0 +1,8 @@
+//! A measured drive: one run, several runs, their statistics and their trajectories.
+
+pub mod closed_loop;
+pub mod drive;
+pub mod observer;
+pub mod run;
+pub mod statistics;
+pub mod trajectory;
