@@ -6,9 +6,10 @@ use super::panel::{Names, Panel, Scene};
 use super::{Onlooker, Video, VideoSummary};
 use crate::dataset::decode::RgbImage;
 use crate::error::{Error, Result};
+use crate::observer::{Observer, Progress};
 use crate::simulator::car::dynamics::MAX_STEER_DEG;
 use crate::simulator::trial::run::{DRIVE_HZ, Failure};
-use crate::simulator::{DriveFrame, DriveObserver, Driver, HEIGHT, Run, RunOptions, Track, WIDTH, run_observed};
+use crate::simulator::{DriveEvent, DriveFrame, Driver, HEIGHT, Run, RunOptions, Track, WIDTH, run_observed};
 
 /// A video of a run that is yet to be driven.
 pub struct DriveVideo {
@@ -23,7 +24,7 @@ struct Filming<'a> {
     film: &'a mut DriveVideo,
     /// Whether the driver looks at pictures, so that its time to answer means something.
     looks: bool,
-    progress: &'a mut dyn FnMut(f64) -> bool,
+    observer: &'a mut dyn Observer<Progress>,
 }
 
 impl DriveVideo {
@@ -45,9 +46,9 @@ impl DriveVideo {
         Ok(DriveVideo { video, scene, onlooker })
     }
 
-    /// Drives the run `seed`, as [`run`](crate::simulator::trial::run::run) does and to the same bits, and writes the video. `progress`
-    /// is told the share of the way that is made and may return `false` to stop; what there is by then is written, and the second
-    /// value is `true`.
+    /// Drives the run `seed`, as [`run`](crate::simulator::trial::run::run) does and to the same bits, and writes the video. `observer`
+    /// is told the share of the way that is made. If it returns [`Error::Interrupted`], what there is by then is written, and the
+    /// second value is `true`.
     ///
     /// # Errors
     ///
@@ -58,10 +59,10 @@ impl DriveVideo {
         driver: &mut dyn Driver,
         options: &RunOptions,
         seed: u64,
-        progress: &mut dyn FnMut(f64) -> bool,
+        observer: &mut dyn Observer<Progress>,
     ) -> Result<(VideoSummary, bool)> {
         let looks = driver.needs_frame();
-        match run_observed(track, driver, options, seed, &mut Filming { film: &mut self, looks, progress }) {
+        match run_observed(track, driver, options, seed, &mut Filming { film: &mut self, looks, observer }) {
             Ok(run) => Ok((self.video.finish(&outcome(&run, options))?, false)),
             Err(Error::Interrupted) => Ok((self.video.finish("stopped")?, true)),
             Err(error) => Err(error),
@@ -69,7 +70,16 @@ impl DriveVideo {
     }
 }
 
-impl DriveObserver for Filming<'_> {
+impl<'e> Observer<DriveEvent<'e>> for Filming<'_> {
+    fn observe(&mut self, event: DriveEvent<'e>) -> Result<()> {
+        match event {
+            DriveEvent::Begin { .. } => Ok(()),
+            DriveEvent::Frame(frame) => self.frame(frame),
+        }
+    }
+}
+
+impl Filming<'_> {
     fn frame(&mut self, frame: &DriveFrame) -> Result<()> {
         let DriveVideo { video, scene, onlooker } = &mut *self.film;
         let simulation = frame.simulation;
@@ -88,10 +98,7 @@ impl DriveObserver for Filming<'_> {
         scene.put_back = frame.put_back;
         video.show(scene)?;
         let way_m = frame.options.laps as f64 * simulation.track.length_m;
-        match (self.progress)((simulation.progress_m / way_m).clamp(0.0, 1.0)) {
-            true => Ok(()),
-            false => Err(Error::Interrupted),
-        }
+        self.observer.observe(Progress((simulation.progress_m / way_m).clamp(0.0, 1.0)))
     }
 }
 

@@ -124,3 +124,12 @@ impl Onlooker {
         Ok((f64::from(steering) * pilot.recipe().full_lock_deg, answered_in))
     }
 }
+
+/// Whether an observer wants no more of a video.
+fn ended_early(observed: Result<()>) -> Result<bool> {
+    match observed {
+        Ok(()) => Ok(false),
+        Err(Error::Interrupted) => Ok(true),
+        Err(error) => Err(error),
+    }
+}

@@ -3,9 +3,10 @@
 use std::path::{Path, PathBuf};
 
 use super::panel::{Names, Panel, Scene};
-use super::{Onlooker, Video, VideoSummary};
+use super::{Onlooker, Video, VideoSummary, ended_early};
 use crate::dataset::decode::RgbImage;
 use crate::error::{Error, Result};
+use crate::observer::{Observer, Progress};
 use crate::report::lettering::end_of;
 use crate::simulator::camera::eye::Eye;
 use crate::simulator::car::dynamics::{MAX_STEER_DEG, MPS_PER_MPH};
@@ -24,7 +25,7 @@ pub struct Choice {
 }
 
 /// Writes the video of a run of the drive in `folder` to the new file `out`. What steered is drawn as it was saved; an
-/// `onlooker` steers in its place, without changing the way. `progress` and the result are as in
+/// `onlooker` steers in its place, without changing the way. `observer` and the result are as in
 /// [`recording::film`](super::recording::film).
 ///
 /// # Errors
@@ -37,7 +38,7 @@ pub fn film(
     out: &Path,
     mut onlooker: Option<Onlooker>,
     fps: Option<f64>,
-    progress: &mut dyn FnMut(f64) -> bool,
+    observer: &mut dyn Observer<Progress>,
 ) -> Result<(VideoSummary, bool)> {
     let (seed, path) = choose(folder, choice)?;
     let track = Track::load(&read_summary(folder)?.track)?;
@@ -80,7 +81,7 @@ pub fn film(
         scene.put_back = waypoint.intervention > 0;
         put_back += usize::from(scene.put_back);
         video.show(&scene)?;
-        if !progress((k + 1) as f64 / way.len() as f64) {
+        if ended_early(observer.observe(Progress((k + 1) as f64 / way.len() as f64)))? {
             stopped = true;
             break;
         }
