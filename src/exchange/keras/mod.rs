@@ -26,7 +26,7 @@ use self::assemble::{Assembly, Context};
 use self::file::KerasFile;
 use self::lambda::Affine;
 use self::limits::{MAX_JSON_BYTES, check_size};
-use self::messages::{listed, shown};
+use self::messages::{Problem, listed, shown};
 use self::translate::{AxisOrder, Operation, Step};
 use crate::dataset::preprocess::Preprocessing;
 use crate::engine::network::{LayerSpec, Network, Parameters};
