@@ -13,8 +13,7 @@ use steersman::main_job::{TrackResult, test_on_track};
 use steersman::observer::{StopSignal, Unobserved};
 use steersman::pilot::Pilot;
 use steersman::recipe::Recipe;
-use steersman::simulator::trial::drive::drive;
-use steersman::simulator::{DriveOptions, Driver, Track, Zero};
+use steersman::simulator::{DriveOptions, Driver, Track, Zero, drive};
 use steersman::training::{TrainRequest, TrainResult, TrainingEvent, train};
 
 fn learn(folder: &Path, threads: usize) -> (TrainResult, TrackResult) {

@@ -10,7 +10,7 @@ use super::share_bar::ShareBar;
 use crate::error::Result;
 use crate::main_job::job::JobEvent;
 use crate::observer::{Observer, StopSignal};
-use crate::report::sparkline::sparkline;
+use crate::report::charts::sparkline::sparkline;
 use crate::training::{EpochRecord, TrainingEvent};
 
 /// Time between plain progress lines.

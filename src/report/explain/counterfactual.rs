@@ -4,11 +4,11 @@
 use rayon::prelude::*;
 use serde::Serialize;
 
-use super::footage::{Footage, Projector};
-use crate::dataset::decode::RgbImage;
 use crate::error::{Error, Result};
 use crate::observer::{Observer, Progress, Tally};
+use crate::picture::RgbImage;
 use crate::pilot::Pilot;
+use crate::report::explain::footage::{Footage, Projector};
 
 /// Where the horizon of Udacity's camera lies, as a share of the height.
 const HORIZON: f64 = 0.355;
@@ -213,14 +213,14 @@ pub struct Counterfactuals {
 ///
 /// # Errors
 ///
-/// As [`Footage::picture`]; [`Error::Usage`] if there is no picture; the observer's own.
+/// As [`Footage::picture`]; [`Error::Input`] if there is no picture; the observer's own.
 pub fn examine(
     pilot: &Pilot,
     footage: &Footage,
     observer: &mut (dyn Observer<Progress> + Send),
 ) -> Result<(Counterfactuals, Vec<f32>)> {
     if footage.is_empty() {
-        return Err(Error::Usage("there is no picture to look at".into()));
+        return Err(Error::Input("there is no picture to look at".into()));
     }
     let tally = Tally::new(footage.len(), observer);
     let fresh = || (pilot.clone(), Projector::default(), RgbImage::default(), RgbImage::default());
