@@ -30,6 +30,7 @@ use crate::engine::tensor::Shape;
 use crate::error::{Error, Result};
 use crate::model_file::{Model, TrainingRecord};
 use crate::recipe::Recipe;
+use crate::text::excerpt;
 
 /// What the user knows beside the file.
 #[derive(Clone, Debug, Default)]
@@ -226,12 +227,7 @@ const SHOWN_ENTRIES: usize = 20;
 
 /// A text from the file, fit for a message: short, and without characters that a terminal obeys.
 fn shown(text: &str) -> String {
-    let mut chars = text.chars().filter(|c| !c.is_control());
-    let mut short: String = chars.by_ref().take(SHOWN_CHARS).collect();
-    if chars.next().is_some() {
-        short.push('…');
-    }
-    short
+    excerpt(text, SHOWN_CHARS)
 }
 
 /// Names from the file in one line.
