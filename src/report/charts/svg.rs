@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use super::palette::INK;
+use crate::report::charts::palette::INK;
 use crate::text::escaped_lines;
 
 /// Fonts every system has one of.
