@@ -1,5 +1,7 @@
 //! What messages say of a file: problems of layers, and texts from the file that are safe to show.
 
+use crate::text::excerpt;
+
 /// Why a layer cannot be imported.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Problem {
