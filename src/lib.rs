@@ -165,6 +165,7 @@ pub mod recipe;
 pub mod report;
 pub mod serve;
 pub mod simulator;
+mod text;
 pub mod training;
 
 pub use error::{Error, Result};
