@@ -60,8 +60,9 @@ pub fn run(args: EvaluateArgs) -> Result<()> {
         predictions.extend(pool.install(|| predict(&pilot, &recording, sessions_before)));
         sessions_before += recording.sessions.len();
     }
-    let metrics = Metrics::of(&predictions, full_lock_deg).ok_or_else(|| {
-        Error::Usage("these recordings have no row that can be used; `steersman inspect` says why".into())
+    let metrics = Metrics::of(&predictions, full_lock_deg).ok_or_else(|| Error::Data {
+        place: "the recordings".into(),
+        message: "no row can be used; `steersman inspect` says why".into(),
     })?;
     if known > 0 {
         eprintln!(

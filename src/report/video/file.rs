@@ -57,7 +57,7 @@ impl VideoFile {
         config.framerate = fps as f32;
         config.gop_size = (KEY_S * fps).round().max(1.0) as u32;
         let encoder = Encoder::new(config)
-            .map_err(|e| Error::Usage(format!("pictures of {width}x{height} pixels make no video: {e}")))?;
+            .map_err(|e| Error::Codec(format!("pictures of {width}x{height} pixels make no video: {e}")))?;
         Ok(VideoFile {
             place: NewFile::create(path)?,
             muxer: None,
@@ -83,18 +83,18 @@ impl VideoFile {
     ///
     /// # Errors
     ///
-    /// [`Error::Usage`] if it has another size or the disk is full, [`Error::Io`] if the file cannot be written.
+    /// [`Error::Input`] if it has another size, [`Error::CannotWrite`] if the disk is full, [`Error::Io`] if the file cannot be written.
     pub fn write(&mut self, picture: &RgbImage) -> Result<()> {
         let [height, width] = self.size;
         if [picture.height, picture.width] != self.size {
             let (h, w) = (picture.height, picture.width);
-            return Err(Error::Usage(format!("a picture of {w}x{h} pixels in a video of {width}x{height}")));
+            return Err(Error::Input(format!("a picture of {w}x{h} pixels in a video of {width}x{height}")));
         }
         self.planes.take(picture);
         let unit = self
             .encoder
             .encode_planes(&self.planes.view(width, height))
-            .map_err(|e| Error::Usage(format!("picture {} cannot be encoded: {e}", self.frames)))?;
+            .map_err(|e| Error::Codec(format!("picture {} cannot be encoded: {e}", self.frames)))?;
         let unit = AccessUnit::parse(&unit);
         if self.muxer.is_none() {
             let opened = begin(BufWriter::new(self.place.open()?), self.size, &unit);
@@ -117,11 +117,11 @@ impl VideoFile {
     ///
     /// # Errors
     ///
-    /// [`Error::Usage`] if there is no picture, something has come to be at the file's place, or the disk is full; [`Error::Io`]
-    /// if it cannot be written.
+    /// [`Error::Input`] if there is no picture, [`Error::Usage`] if another program has created the file, [`Error::CannotWrite`] if
+    /// the disk is full, [`Error::Io`] if it cannot be written.
     pub fn finish(mut self) -> Result<VideoSummary> {
         let Some(mut muxer) = self.muxer.take() else {
-            return Err(Error::Usage("a video without a picture is not written".into()));
+            return Err(Error::Input("a video without a picture is not written".into()));
         };
         muxer.write_end().map_err(|e| self.explain(e))?;
         muxer.into_writer().into_inner().map_err(|e| self.place.explain(e.into_error()))?;
@@ -133,7 +133,7 @@ impl VideoFile {
     fn explain(&self, error: mp4::Error) -> Error {
         match error {
             mp4::Error::IoError(source) => self.place.explain(source),
-            other => Error::Usage(format!("the video cannot be written: {other}")),
+            other => Error::Codec(format!("the video cannot be written: {other}")),
         }
     }
 }

@@ -74,10 +74,10 @@ impl Video {
     ///
     /// # Errors
     ///
-    /// [`Error::Usage`] if nothing was shown; if the file cannot be written.
+    /// [`Error::Input`] if nothing was shown; if the file cannot be written.
     pub fn finish(mut self, text: &str) -> Result<VideoSummary> {
         if self.pace.is_empty() {
-            return Err(Error::Usage("there is nothing to show, so no video was written".into()));
+            return Err(Error::Input("there is nothing to show, so no video was written".into()));
         }
         self.pace.hold(FAREWELL_S, |picture| Panel::farewell(text, picture))?;
         self.pace.finish()
