@@ -5,8 +5,8 @@
 //!
 //! | algorithm | passes | condition | how |
 //! |---|---|---|---|
-//! | `winograd` | all | kernels of 3 rows, or 5 with a stride of 2, on maps large enough to gain (`winograd::choice`) | Winograd minimal filtering along the rows: half to two thirds of the products |
 //! | `patch_gradient` | input gradient | maps of so few rows that most taps would multiply zeros (3x18) | a matrix product gives the gradient of each patch; overlapping patches are added up |
+//! | `winograd` | all | kernels of 3 rows, or 5 with a stride of 2, on maps large enough to gain (`winograd::choice`) | Winograd minimal filtering along the rows: half to two thirds of the products |
 //! | `direct` | forward, weight gradient | any | a sum over taps, with vectors along the output rows |
 //! | `input_gradient` | input gradient | any | the same sum over the zero-padded output gradient, with the kernel turned by 180 degrees |
 //! | `sparse` | both gradients | behind 4x4 max pooling; the caller asks for it | one multiply-add at a time at the few positions with a gradient |
@@ -118,6 +118,11 @@ impl Conv {
     /// The instruction set it runs on.
     pub fn isa(&self) -> Isa {
         self.backend.isa
+    }
+
+    /// How it was told to compute its passes.
+    pub fn algorithm(&self) -> ConvAlgorithm {
+        self.backend.conv
     }
 
     /// Length of the scratch buffer that is enough for every pass, whatever the number of images.

@@ -20,9 +20,8 @@ impl ConvAlgorithm {
     /// The variable is there for tests. It is read once; an unknown name is ignored.
     pub fn of_environment() -> ConvAlgorithm {
         static NAMED: OnceLock<ConvAlgorithm> = OnceLock::new();
-        *NAMED.get_or_init(|| {
-            std::env::var("STEERSMAN_CONV").ok().and_then(|name| name.parse().ok()).unwrap_or_default()
-        })
+        *NAMED
+            .get_or_init(|| std::env::var("STEERSMAN_CONV").ok().and_then(|name| name.parse().ok()).unwrap_or_default())
     }
 
     /// The name that [`FromStr`] reads.

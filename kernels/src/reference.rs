@@ -9,9 +9,7 @@ use crate::update::AdamStep;
 
 /// See [`crate::gemm::gemm`] and [`crate::sgemm::sgemm`].
 pub fn gemm(alpha: f32, a: Matrix, b: Matrix, beta: f32, c: MatrixMut) {
-    let at = |matrix: Matrix, i: usize, j: usize| {
-        f64::from(matrix.values[i * matrix.strides.0 + j * matrix.strides.1])
-    };
+    let at = |matrix: Matrix, i: usize, j: usize| f64::from(matrix.values[i * matrix.strides.0 + j * matrix.strides.1]);
     for i in 0..a.rows {
         for j in 0..b.columns {
             let sum: f64 = (0..a.columns).map(|p| at(a, i, p) * at(b, p, j)).sum();

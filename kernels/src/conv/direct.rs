@@ -100,14 +100,7 @@ impl Direct {
     }
 
     /// Adds the gradients of `y = conv(x, weight) + bias` with respect to weight and bias to `dweight` and `dbias`.
-    pub fn backward_weight(
-        &self,
-        x: &[f32],
-        dy: &[f32],
-        dweight: &mut [f32],
-        dbias: &mut [f32],
-        scratch: &mut [f32],
-    ) {
+    pub fn backward_weight(&self, x: &[f32], dy: &[f32], dweight: &mut [f32], dbias: &mut [f32], scratch: &mut [f32]) {
         let (copy, scratch) = scratch.split_at_mut(self.copy_len(GRADIENT_COPIES));
         self.for_each_group(x, dy.len(), copy, GRADIENT_COPIES, |x, images| {
             weight_gradient::run(self.isa, &self.sum, x, &dy[images], dweight, dbias, scratch);

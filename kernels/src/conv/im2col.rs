@@ -61,19 +61,17 @@ impl Im2col {
                 y.fill(bias);
             }
             let columns = self.columns(x, scratch);
-            sgemm(Matrix::new(weight, oc, taps), Matrix::new(columns, taps, pixels), 1.0, MatrixMut::new(y, oc, pixels));
+            sgemm(
+                Matrix::new(weight, oc, taps),
+                Matrix::new(columns, taps, pixels),
+                1.0,
+                MatrixMut::new(y, oc, pixels),
+            );
         }
     }
 
     /// `dW += dY X'` and `db += sum over pixels of dY`, summed over the images; forward was `Y = W X + b`.
-    pub fn backward_weight(
-        &self,
-        x: &[f32],
-        dy: &[f32],
-        dweight: &mut [f32],
-        dbias: &mut [f32],
-        scratch: &mut [f32],
-    ) {
+    pub fn backward_weight(&self, x: &[f32], dy: &[f32], dweight: &mut [f32], dbias: &mut [f32], scratch: &mut [f32]) {
         let (oc, taps, pixels) = (self.shape.oc, self.shape.taps(), self.shape.out_pixels());
         let images = x.chunks_exact(self.shape.x_len()).zip(dy.chunks_exact(self.shape.y_len()));
         for (x, dy) in images {

@@ -21,14 +21,7 @@ per_isa! {
 }
 
 #[inline(always)]
-fn run_rows<S: Simd, const MR: usize>(
-    simd: S,
-    alpha: f32,
-    a: Matrix,
-    b: Matrix,
-    beta: f32,
-    c: &mut MatrixMut,
-) {
+fn run_rows<S: Simd, const MR: usize>(simd: S, alpha: f32, a: Matrix, b: Matrix, beta: f32, c: &mut MatrixMut) {
     let (m, k, n) = (a.rows, a.columns, b.columns);
     let (a, a_stride, b, b_stride) = (a.values, a.strides.0, b.values, b.strides.1);
     let (c, c_strides) = (&mut *c.values, c.strides);
