@@ -54,7 +54,8 @@
 //! // The recipe is the experiment: preprocessing, network, split, optimizer. A path ending in .toml names one of your own.
 //! let recipe = Recipe::find("lenet", &["epochs=2".into(), "batch=16".into()])?;
 //! let recordings = vec!["data/sample".into()];
-//! let request = TrainRequest { recordings, recipe, out, seed: 1, cache_mib: 64, from: None, profile: false };
+//! let (from, algorithm, profile) = (None, None, false);
+//! let request = TrainRequest { recordings, recipe, out, seed: 1, cache_mib: 64, from, algorithm, profile };
 //! let stop = StopSignal::default(); // requested from elsewhere, it ends the run after the current batch
 //! let mut observer = |event| {
 //!     match event {

@@ -30,6 +30,7 @@ fn learn(folder: &Path, threads: usize) -> (TrainResult, TrackResult) {
             cache_mib: 256,
             from: None,
             profile: false,
+            algorithm: None,
         };
         let result = train(request, &mut Unobserved, &StopSignal::default()).unwrap();
         let pilot = Pilot::load(&result.model).unwrap();
@@ -82,8 +83,14 @@ fn a_job_that_was_stopped_goes_on_through_dagger_to_the_drives() {
     let folder = tempfile::tempdir().unwrap();
     let never = StopSignal::default();
     let note = JobNote { runs: 1, dagger_rounds: 1, round: 0 };
-    let request =
-        |name: &str| JobRequest { recipe: lenet(2), out: folder.path().join(name), seed: 5, cache_mib: 64, from: None };
+    let request = |name: &str| JobRequest {
+        recipe: lenet(2),
+        out: folder.path().join(name),
+        seed: 5,
+        cache_mib: 64,
+        from: None,
+        algorithm: None,
+    };
     let (mut watcher, scope) = (Unobserved, small_scope(folder.path()));
     let mut whole = Job::new(scope.clone(), note.clone(), &mut watcher, &never);
     let expected = whole.begin(request("whole")).unwrap();

@@ -147,6 +147,7 @@ pub fn run(
                 cache_mib: plan.cache_mib,
                 from: None,
                 profile: false,
+                algorithm: None,
             };
             let mut of_job = |event| observer.observe(ExperimentEvent::Job(event));
             let training = training::train(request, &mut |event| of_job(JobEvent::Training(event)), stop)?;

@@ -4,9 +4,11 @@ use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
+use steersman_kernels::conv::ConvAlgorithm;
 
 use super::training_set::{self, Take};
 use super::{MainJobResult, TRACKS, TrackResult, dagger, test_on_track};
+
 use crate::error::{Error, Result};
 use crate::files::atomic_file;
 use crate::observer::{Observer, Parts, Progress, StopSignal};
@@ -131,6 +133,8 @@ pub struct JobRequest {
     pub cache_mib: usize,
     /// Weights to begin the first training with; rounds of DAgger begin anew.
     pub from: Option<TransferRequest>,
+    /// As in [`TrainRequest::algorithm`].
+    pub algorithm: Option<ConvAlgorithm>,
 }
 
 impl<'a> Job<'a> {
@@ -160,14 +164,15 @@ impl<'a> Job<'a> {
     ///
     /// As [`training_set::recordings`], [`training::train`] and [`test_on_track`]; [`Error::Interrupted`] after a stop.
     pub fn begin(&mut self, request: JobRequest) -> Result<MainJobResult> {
-        let JobRequest { recipe, out, seed, cache_mib, from } = request;
+        let JobRequest { recipe, out, seed, cache_mib, from, algorithm } = request;
         RunFolder::require_free(&out)?;
         for round in 1..=self.note.dagger_rounds {
             RunFolder::require_free(&dagger_folder(&out, 0, round)?)?;
         }
         let recordings = training_set(&self.scope.recordings, &self.scope.takes, self.observer, self.stop)?;
         let profile = self.profile;
-        let training = self.train(TrainRequest { recordings, recipe, out, seed, cache_mib, from, profile })?;
+        let training =
+            self.train(TrainRequest { recordings, recipe, out, seed, cache_mib, from, profile, algorithm })?;
         self.rest(training)
     }
 
@@ -223,6 +228,7 @@ impl<'a> Job<'a> {
         let recorded = observed(what, self.observer, self.stop, |observer| {
             dagger::recordings(&pilot, takes, &path.join("dagger"), round, observer)
         })?;
+        let algorithm = Some(info.conv_algorithm(&folder)?);
         let mut recordings = info.recordings;
         recordings.extend(recorded);
         self.note.round = round;
@@ -231,7 +237,7 @@ impl<'a> Job<'a> {
             return self.resume(&out);
         }
         let (seed, cache_mib, profile) = (info.seed, info.cache_mib, self.profile);
-        self.train(TrainRequest { recordings, recipe, out, seed, cache_mib, from: None, profile })
+        self.train(TrainRequest { recordings, recipe, out, seed, cache_mib, from: None, profile, algorithm })
     }
 
     /// Whether `out` holds the run of this job's round on `recordings` already, begun before a stop.

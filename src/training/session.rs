@@ -4,7 +4,8 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use serde::{Deserialize, Serialize};
-use steersman_kernels::Isa;
+use steersman_kernels::conv::ConvAlgorithm;
+use steersman_kernels::{Backend, Isa};
 
 use super::checkpoint::{Progress, State};
 use super::data::Data;
@@ -42,6 +43,8 @@ pub struct TrainRequest {
     pub cache_mib: usize,
     /// A model to begin from instead of fresh weights.
     pub from: Option<TransferRequest>,
+    /// How convolutions are computed; `None` for [`ConvAlgorithm::of_environment`].
+    pub algorithm: Option<ConvAlgorithm>,
     /// Whether the result says where the time went.
     pub profile: bool,
 }
@@ -99,6 +102,9 @@ pub struct TrainResult {
     pub seconds: f64,
     /// Training images a second while training, validation left out.
     pub images_per_second: f64,
+    /// How convolutions were computed, if not by the default algorithms: `im2col`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub algorithm: Option<String>,
     /// Over all tensors of the last model.
     pub weights_hash: String,
     /// Share of validation frames with a training frame of the same session within a second, in percent.
@@ -123,8 +129,9 @@ pub fn train(
     stop: &StopSignal,
 ) -> Result<TrainResult> {
     let started = Instant::now();
-    let TrainRequest { recordings, recipe, out, seed, cache_mib, from, profile } = request;
+    let TrainRequest { recordings, recipe, out, seed, cache_mib, from, algorithm, profile } = request;
     let profile = profile.then(Profile::start);
+    let algorithm = algorithm.unwrap_or_else(ConvAlgorithm::of_environment);
     let start = from.as_ref().map(|from| Start::load(&from.model, from, &recipe, seed)).transpose()?;
     let data = Data::prepare(&recordings, &recipe, seed, cache_mib)?;
     let mut trained_on_held_out = held_out_tracks(&recordings)?;
@@ -139,6 +146,7 @@ pub fn train(
     let info = RunInfo {
         version: env!("CARGO_PKG_VERSION").into(),
         isa: Isa::best().name().into(),
+        algorithm: (algorithm != ConvAlgorithm::Auto).then(|| algorithm.to_string()),
         seed,
         recordings: recordings.iter().map(absolute).collect::<Result<_>>()?,
         cache_mib,
@@ -222,7 +230,7 @@ impl Session {
         start: Option<Start>,
         started: Instant,
     ) -> Result<Session> {
-        let mut network = recipe.network(Isa::best())?;
+        let mut network = recipe.network(Backend { isa: Isa::best(), conv: info.conv_algorithm(&folder)? })?;
         if let Some(start) = &start {
             network.freeze(&start.transfer.frozen)?;
         }
@@ -525,6 +533,7 @@ impl Session {
             val_images: self.validation.as_ref().map_or(0, Validation::images),
             seconds: progress.seconds,
             images_per_second: images as f64 / seconds,
+            algorithm: self.info.algorithm.clone(),
             weights_hash: weights_hash(&self.network, &self.state.parameters),
             leak_percent: self.leak_percent,
             trained_on_held_out: self.info.trained_on_held_out.clone(),
