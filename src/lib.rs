@@ -166,6 +166,7 @@ pub mod recipe;
 pub mod report;
 pub mod serve;
 pub mod simulator;
+mod statistics;
 mod text;
 pub mod training;
 

@@ -15,8 +15,8 @@ use steersman::observer::Unobserved;
 use steersman::pilot::Pilot;
 use steersman::serve::client::{ClientOptions, ClientReport, Numbers, Pace, drive};
 use steersman::serve::protocol::DecimalMark;
-use steersman::simulator::trial::run::run;
-use steersman::simulator::{RunOptions, Speed, Track};
+use steersman::simulator::run_trial;
+use steersman::simulator::{Speed, Track, TrialOptions};
 
 /// Long enough for an answer that must not come. (Where the machine stands still, a wrong answer could be missed, not invented.)
 const QUIET: Duration = Duration::from_millis(400);
@@ -56,8 +56,8 @@ fn in_lockstep_the_way_through_the_server_is_the_way_of_drive_bit_for_bit_in_eve
     let folder = folder_with_model();
     let served = serve(&folder, &[]);
     let mut pilot = Pilot::load(&folder.path().join("model")).unwrap();
-    let options = RunOptions { laps: 1, speed: Speed::Fixed(20.0), latency_ms: 0.0, noise: 0.0, assisted: false };
-    let expected = run(&Track::load("lake").unwrap(), &mut pilot, &options, 2).unwrap();
+    let options = TrialOptions { laps: 1, speed: Speed::Fixed(20.0), latency_ms: 0.0, noise: 0.0, assisted: false };
+    let expected = run_trial(&Track::load("lake").unwrap(), &mut pilot, &options, 2).unwrap();
     assert!(expected.moments.len() > 30, "{} frames are too few to prove something", expected.moments.len());
     for mark in [DecimalMark::DOT, DecimalMark::COMMA] {
         let report = drive_lake(&ClientOptions { numbers: Numbers::Strings(mark), ..lockstep(&served) });

@@ -14,9 +14,9 @@ use crate::observer::Observer;
 use crate::serve::client::{ClientEvent, ClientOptions, ClientReport, Numbers, Pace, ServerUrl, drive};
 use crate::serve::protocol::DecimalMark;
 use crate::simulator::Track;
-use crate::simulator::trial::run::{Failure, line_errors_m};
-use crate::simulator::trial::statistics::quantile;
+use crate::simulator::trial::outcome::{Failure, line_errors_m};
 use crate::simulator::trial::trajectory::trajectory_csv;
+use crate::statistics::quantile;
 
 /// Put the built-in simulator in the place of Udacity's: it connects to a driving server, as `serve` is one
 #[derive(Debug, Args)]

@@ -9,13 +9,13 @@ use super::handshake::ServerUrl;
 use super::reaction::{Numbers, Steer};
 use crate::observer::{Observer, Progress};
 use crate::serve::protocol::{DecimalMark, Readings, print_telemetry};
-use crate::simulator::camera::eye::Eye;
+use crate::simulator::camera::front_camera::FrontCamera;
 use crate::simulator::car::dynamics::{MAX_STEER_DEG, STEP_S};
 use crate::simulator::car::expert::pursuit;
 use crate::simulator::car::speed::{Speed, telemetry_mph};
-use crate::simulator::road::track::Track;
+use crate::simulator::track::Track;
 use crate::simulator::trial::closed_loop::ClosedLoop;
-use crate::simulator::trial::run::{Run, RunOptions};
+use crate::simulator::trial::outcome::{Trial, TrialOptions};
 use crate::{Error, Result};
 
 /// Most simulated time that one frame may make up for (Unity's maximum allowed timestep), s.
@@ -84,7 +84,7 @@ impl Default for ClientOptions {
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ClientReport {
     /// What the car did since the scene was entered last.
-    pub run: Run,
+    pub run: Trial,
     /// Frames: chances to send telemetry.
     pub frames: u64,
     /// Telemetries sent with a picture.
@@ -177,7 +177,7 @@ struct Scene<'a> {
     options: &'a ClientOptions,
     observer: &'a mut dyn Observer<ClientEvent>,
     connection: Connection,
-    eye: Eye<'a>,
+    eye: FrontCamera<'a>,
     /// The picture in base64, and the step at which it was taken.
     image: String,
     image_step: Option<u64>,
@@ -206,7 +206,7 @@ struct Scene<'a> {
 impl<'a> Scene<'a> {
     fn new(track: &'a Track, options: &'a ClientOptions, observer: &'a mut dyn Observer<ClientEvent>) -> Scene<'a> {
         // The world takes a while to build, and a server does not like to wait for the first telemetry.
-        let eye = Eye::new(track, options.seed);
+        let eye = FrontCamera::new(track, options.seed);
         Scene {
             track,
             options,
@@ -242,8 +242,8 @@ impl<'a> Scene<'a> {
     }
 
     /// Drives from the start to the end of the run, or until the scene is left.
-    fn play(&mut self, leave_at_s: Option<f64>) -> Result<Run> {
-        let run = RunOptions {
+    fn play(&mut self, leave_at_s: Option<f64>) -> Result<Trial> {
+        let run = TrialOptions {
             laps: self.options.laps,
             speed: Speed::Fixed(self.options.start_mph),
             latency_ms: 0.0,
