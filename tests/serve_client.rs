@@ -10,11 +10,11 @@ use data_encoding::BASE64;
 use serde_json::Value;
 use steersman::Error;
 use steersman::dataset::decode::{RgbImage, decode_rgb};
-use steersman::serve::client::{ClientOptions, ClientReport, Numbers, Observer, Pace, drive};
-use steersman::serve::protocol::DecimalMark;
 use steersman::simulator::car::speed::SpeedController;
 use steersman::simulator::trial::run::run;
 use steersman::simulator::{DriveState, Driver, RgbFrame, RunOptions, Speed, Track};
+use steersman::simulator_client::{ClientOptions, ClientReport, Observer, TimeMode, drive};
+use steersman::udacity::{DecimalMark, NumberStyle};
 
 struct Silent;
 
@@ -30,7 +30,7 @@ fn lockstep(port: u16, frames: u64) -> ClientOptions {
     ClientOptions {
         url: format!("ws://127.0.0.1:{port}").parse().unwrap(),
         seed: 3,
-        pace: Pace::Lockstep,
+        time_mode: TimeMode::Lockstep,
         frames: Some(frames),
         ..ClientOptions::default()
     }
@@ -310,7 +310,7 @@ fn a_machine_with_decimal_comma_writes_commas_and_misreads_dots() {
         while peer.next().is_some_and(|text| text != "41") {}
         (first, second)
     });
-    let comma = Numbers::Strings(DecimalMark::COMMA);
+    let comma = NumberStyle::Strings(DecimalMark::COMMA);
     let report = drive_lake(&ClientOptions { numbers: comma, ..lockstep(port, 2) });
     let (first, second) = server.join().unwrap();
     assert!(first.contains(r#""speed":"20,0000""#) && second.contains(r#""steering_angle":"3,1250""#), "{second:.120}");
@@ -353,7 +353,7 @@ fn in_real_time_the_clock_goes_on_without_replies_and_the_car_keeps_its_last_com
         }
         telemetries
     });
-    let options = ClientOptions { pace: Pace::RealTime { fps: 50.0 }, frames: None, ..lockstep(port, 0) };
+    let options = ClientOptions { time_mode: TimeMode::RealTime { fps: 50.0 }, frames: None, ..lockstep(port, 0) };
     let report = drive_lake(&options);
     assert_eq!(server.join().unwrap(), 1, "one for the command, then the token is gone");
     assert!(report.run.failure.is_some(), "{:?}", report.run.failure);
@@ -397,7 +397,7 @@ fn impossible_options_are_refused_before_anything_is_connected() {
     for options in [
         ClientOptions { laps: 0, ..ClientOptions::default() },
         ClientOptions { start_mph: 99.0, ..ClientOptions::default() },
-        ClientOptions { pace: Pace::RealTime { fps: 0.0 }, ..ClientOptions::default() },
+        ClientOptions { time_mode: TimeMode::RealTime { fps: 0.0 }, ..ClientOptions::default() },
         ClientOptions { manual_s: Some((5.0, 2.0)), ..ClientOptions::default() },
         ClientOptions { scene_change_s: Some(f64::NAN), ..ClientOptions::default() },
         ClientOptions { patience_s: 0.0, ..ClientOptions::default() },

@@ -1,3 +1,6 @@
+use std::borrow::Cow;
+
+use super::number::Number;
 use super::*;
 
 /// The simulator's own telemetry, the image cut short.
@@ -52,7 +55,7 @@ fn a_client_of_the_second_term_gets_numbers() {
     let read = telemetry(
         r#"42["telemetry",{"cte":"0.7598","speed":"0.4380","steering_angle":"0.0000","throttle":"0.0000","image":"AA=="}]"#,
     );
-    assert_eq!(read.number_style(), NumberStyle::Numbers);
+    assert_eq!(read.number_style(), NumberStyle::Json);
     assert_eq!(steer(-0.5, 1.0, read.number_style()), r#"42["steer",{"steering_angle":-0.5,"throttle":1}]"#);
 }
 

@@ -1,15 +1,17 @@
-//! WebSocket frames (RFC 6455, section 5) from the client's side, cut as websocket-sharp 1.0 cuts them.
+//! WebSocket frames (RFC 6455, section 5) of a client. It cuts messages into frames as websocket-sharp 1.0 does, which no
+//! library can be told to do.
 
 use std::io::{self, Read, Write};
 
-use crate::simulator::math::Rng;
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
 
-/// Longest payload of a frame that is sent; longer messages go out in pieces of this length.
+/// Longest payload of a frame that the client sends. It cuts longer messages into pieces of this length.
 pub const FRAGMENT_LEN: usize = 1016;
-/// Longest message that is taken from a server.
+/// Longest message of a server that the client reads.
 const MAX_MESSAGE_LEN: usize = 1 << 24;
 
-/// A message is complete with this frame.
+/// Bit of the last frame of a message.
 const FIN: u8 = 0x80;
 const CONTINUATION: u8 = 0x0;
 const TEXT: u8 = 0x1;
@@ -18,18 +20,18 @@ const CLOSE: u8 = 0x8;
 const PING: u8 = 0x9;
 const PONG: u8 = 0xa;
 
-/// Puts messages on a stream, each frame in one write and under a mask of its own.
+/// Writes messages to a stream, each frame in one write and with a mask of its own.
 #[derive(Debug)]
 pub struct FrameWriter<W> {
     stream: W,
-    masks: Rng,
+    masks: ChaCha8Rng,
     frame: Vec<u8>,
 }
 
 impl<W: Write> FrameWriter<W> {
-    /// A writer whose masks `seed` draws.
+    /// A writer that draws its masks from `seed`.
     pub fn new(stream: W, seed: u64) -> FrameWriter<W> {
-        FrameWriter { stream, masks: Rng::new(seed, "websocket masks"), frame: Vec::new() }
+        FrameWriter { stream, masks: ChaCha8Rng::seed_from_u64(seed), frame: Vec::new() }
     }
 
     /// The stream.
@@ -82,7 +84,8 @@ impl<W: Write> FrameWriter<W> {
                 self.frame.extend_from_slice(&(len as u16).to_be_bytes());
             }
         }
-        let mask = (self.masks.next_u64() as u32).to_be_bytes();
+        let mut mask = [0; 4];
+        self.masks.fill_bytes(&mut mask);
         self.frame.extend_from_slice(&mask);
         self.frame.extend(payload.iter().zip(mask.iter().cycle()).map(|(byte, mask)| byte ^ mask));
         self.stream.write_all(&self.frame)
@@ -94,9 +97,9 @@ impl<W: Write> FrameWriter<W> {
 pub enum Incoming {
     /// A complete text.
     Text(String),
-    /// A complete binary message, which this client has no use for.
+    /// A complete binary message.
     Binary,
-    /// A ping and what is to be sent back.
+    /// A ping, and the payload of its pong.
     Ping(Vec<u8>),
     /// A pong.
     Pong,
@@ -104,16 +107,16 @@ pub enum Incoming {
     Close(Option<u16>),
 }
 
-/// Takes messages from a stream.
+/// Reads messages from a stream.
 #[derive(Debug)]
 pub struct FrameReader<R> {
     stream: R,
-    /// The message so far, if one has begun, and its opcode.
+    /// The opcode and the bytes so far of a message that is not complete.
     begun: Option<(u8, Vec<u8>)>,
 }
 
 impl<R: Read> FrameReader<R> {
-    /// A reader after the handshake.
+    /// A reader of what follows the handshake.
     pub fn new(stream: R) -> FrameReader<R> {
         FrameReader { stream, begun: None }
     }

@@ -1,101 +1,38 @@
-//! The opening handshake (RFC 6455, section 4) with the words of websocket-sharp 1.0.
+//! The opening handshake (RFC 6455, section 4) with the headers and checks of websocket-sharp 1.0.
 
-use std::fmt;
 use std::io::{self, BufRead, Read, Write};
-use std::str::FromStr;
 
-use data_encoding::BASE64;
+use tungstenite::handshake::client::generate_key;
 use tungstenite::handshake::derive_accept_key;
 
-use crate::simulator::math::Rng;
-use crate::{Error, Result};
+use super::server_url::ServerUrl;
+use crate::net::handshake::list_has;
+use crate::text::excerpt;
 
-/// Longest header of a response that is read.
+/// Longest header of a response, bytes.
 const MAX_HEADER_LEN: u64 = 8192;
 
-/// Where the server is.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct ServerUrl {
-    /// Host and port as they stand in the URL.
-    authority: String,
-    /// Path and query.
-    path: String,
-}
-
-impl Default for ServerUrl {
-    fn default() -> Self {
-        ServerUrl::DEFAULT.parse().expect("the built-in address is one")
-    }
-}
-
-impl ServerUrl {
-    /// The address that is built into Udacity's simulator.
-    pub const DEFAULT: &str = "ws://127.0.0.1:4567/socket.io/?EIO=4&transport=websocket";
-
-    /// `host:port` to connect to.
-    pub fn address(&self) -> String {
-        let has_port = self.authority.rsplit_once(':').is_some_and(|(_, port)| port.parse::<u16>().is_ok());
-        if has_port { self.authority.clone() } else { format!("{}:80", self.authority) }
-    }
-}
-
-impl FromStr for ServerUrl {
-    type Err = Error;
-
-    fn from_str(text: &str) -> Result<ServerUrl> {
-        let fail = |what: &str| Err(Error::Usage(format!("{text}: {what}; as in {}", ServerUrl::default())));
-        let Some(rest) = text.strip_prefix("ws://") else {
-            return fail("an address that begins with ws:// is meant");
-        };
-        let at = rest.find(['/', '?']).unwrap_or(rest.len());
-        let (authority, path) = rest.split_at(at);
-        if authority.is_empty() || authority.contains(['@', '#', ' ']) || path.contains(['#', ' ', '\r', '\n']) {
-            return fail("no host and port, or something else than path and query behind them");
-        }
-        let path = match path {
-            "" | "/" => ServerUrl::default().path,
-            path if path.starts_with('?') => format!("/{path}"),
-            path => path.into(),
-        };
-        Ok(ServerUrl { authority: authority.into(), path })
-    }
-}
-
-impl fmt::Display for ServerUrl {
-    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
-        write!(f, "ws://{}{}", self.authority, self.path)
-    }
-}
-
-/// Asks the server at `url` to speak WebSocket and checks its answer, as websocket-sharp does.
+/// Asks the server at `url` for a WebSocket and checks its response as websocket-sharp does.
 ///
 /// # Errors
-/// [`io::ErrorKind::InvalidData`] with what websocket-sharp objects to, or what the stream says.
-pub fn shake_hands(
-    writer: &mut impl Write,
-    reader: &mut (impl BufRead + ?Sized),
-    url: &ServerUrl,
-    keys: &mut Rng,
-) -> io::Result<()> {
-    let mut nonce = [0; 16];
-    nonce[..8].copy_from_slice(&keys.next_u64().to_be_bytes());
-    nonce[8..].copy_from_slice(&keys.next_u64().to_be_bytes());
-    let key = BASE64.encode(&nonce);
+///
+/// [`io::ErrorKind::InvalidData`] with the objection of websocket-sharp, or the error of the stream.
+pub fn shake_hands(writer: &mut impl Write, reader: &mut (impl BufRead + ?Sized), url: &ServerUrl) -> io::Result<()> {
+    let key = generate_key();
     writer.write_all(request(url, &key).as_bytes())?;
     check(&read_header(reader)?, &key).map_err(|objection| io::Error::new(io::ErrorKind::InvalidData, objection))
 }
 
 /// The request, header by header in websocket-sharp's order.
 fn request(url: &ServerUrl, key: &str) -> String {
-    let ServerUrl { authority, path } = url;
-    let host = authority.strip_suffix(":80").unwrap_or(authority);
+    let (host, path) = (url.host(), url.path());
     format!(
         "GET {path} HTTP/1.1\r\nUser-Agent: websocket-sharp/1.0\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n\
          Host: {host}\r\nSec-WebSocket-Key: {key}\r\nSec-WebSocket-Version: 13\r\n\r\n"
     )
 }
 
-/// Reads up to the empty line and not a byte further.
+/// Reads up to the empty line and not one byte more.
 fn read_header(reader: &mut (impl BufRead + ?Sized)) -> io::Result<Vec<u8>> {
     let mut header = Vec::new();
     let mut limited = reader.take(MAX_HEADER_LEN);
@@ -108,7 +45,7 @@ fn read_header(reader: &mut (impl BufRead + ?Sized)) -> io::Result<Vec<u8>> {
     Ok(header)
 }
 
-/// What websocket-sharp objects to in the response to a request with `key`.
+/// Checks the response to a request with `key`. The error is the objection of websocket-sharp.
 fn check(header: &[u8], key: &str) -> Result<(), String> {
     let mut fields = [httparse::EMPTY_HEADER; 64];
     let mut response = httparse::Response::new(&mut fields);
@@ -119,12 +56,10 @@ fn check(header: &[u8], key: &str) -> Result<(), String> {
         let field = response.headers.iter().find(|field| field.name.eq_ignore_ascii_case(name))?;
         Some(String::from_utf8_lossy(field.value).into_owned())
     };
-    let lists = |name: &str, word: &str| {
-        field(name).is_some_and(|list| list.split(',').any(|item| item.trim().eq_ignore_ascii_case(word)))
-    };
+    let lists = |name: &str, word: &str| field(name).is_some_and(|list| list_has(&list, word));
     let upgraded = response.code == Some(101) && response.version == Some(1);
     if !(upgraded && lists("Upgrade", "websocket") && lists("Connection", "Upgrade")) {
-        let (code, reason) = (response.code.unwrap_or(0), response.reason.unwrap_or(""));
+        let (code, reason) = (response.code.unwrap_or(0), excerpt(response.reason.unwrap_or(""), 80));
         return Err(format!("the server does not switch to WebSocket: {code} {reason}"));
     }
     if field("Sec-WebSocket-Accept") != Some(derive_accept_key(key.as_bytes())) {
@@ -192,21 +127,5 @@ mod tests {
         let mut endless = io::BufReader::new(io::repeat(b'x'));
         assert!(read_header(&mut endless).unwrap_err().to_string().contains("8 KiB"));
         assert!(read_header(&mut &b"HTTP/1.1 101"[..]).unwrap_err().to_string().contains("no complete header"));
-    }
-
-    #[test]
-    fn addresses() {
-        for (text, address, shown) in [
-            ("ws://127.0.0.1:4567", "127.0.0.1:4567", "ws://127.0.0.1:4567/socket.io/?EIO=4&transport=websocket"),
-            ("ws://host:9/?EIO=3", "host:9", "ws://host:9/?EIO=3"),
-            ("ws://host/x", "host:80", "ws://host/x"),
-            ("ws://[::1]:7?y", "[::1]:7", "ws://[::1]:7/?y"),
-        ] {
-            let url: ServerUrl = text.parse().unwrap();
-            assert_eq!((url.address().as_str(), url.to_string().as_str()), (address, shown));
-        }
-        for bad in ["127.0.0.1:4567", "http://x", "ws://", "ws:///x", "ws://a b", "ws://x/\r\ny"] {
-            assert!(bad.parse::<ServerUrl>().unwrap_err().to_string().contains("as in ws://127.0.0.1:4567"), "{bad}");
-        }
     }
 }

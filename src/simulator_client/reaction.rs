@@ -1,28 +1,19 @@
-//! What the simulator's C# makes of a message of the server: its packet decoder, event parser and number parser, with their
-//! holes.
+//! How the simulator's C# code reads a message of the server: its packet decoder, event parser and number parser, with their
+//! faults.
 
 use serde_json::Value;
 
-use crate::serve::protocol::DecimalMark;
+use crate::udacity::{DecimalMark, NumberStyle};
 
-/// Bias that the simulators of the second term add to each steering command: one degree in radians.
+/// The simulators of the second term add this to each steering command: one degree in radians.
 const TERM_2_BIAS: f32 = std::f32::consts::PI / 180.0;
 
-/// How this client reads the numbers of a command.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Numbers {
-    /// JSON strings in this language: the behavioural-cloning simulator.
-    Strings(DecimalMark),
-    /// JSON numbers: the simulators of the second term.
-    Json,
-}
-
-/// What one message does.
+/// The effect of a message.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Reaction {
     /// Nothing.
     Ignored,
-    /// `2`: a pong is sent.
+    /// `2`: the client sends a pong.
     Ping,
     /// `3`: the answer to a ping.
     Pong,
@@ -34,22 +25,22 @@ pub enum Reaction {
     Manual,
 }
 
-/// What is left of a command when the handler is through with it, or fell over it.
+/// What the handler reads of a command before it ends or throws.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Steer {
     /// Steering, [-1, 1], if it could be read.
     pub steering: Option<f32>,
-    /// Throttle, [-1, 1], if it and the steering could be read. Only then telemetry follows; otherwise the handler threw,
-    /// nobody noticed, and the token is lost.
+    /// Throttle, [-1, 1], if it and the steering could be read. Only then does telemetry follow; otherwise the handler throws
+    /// and the token is lost.
     pub throttle: Option<f32>,
 }
 
-/// What the client does on `text`.
+/// The effect of the message `text` on the client.
 ///
 /// # Errors
-/// A message that makes its decoder or parser throw, with the reason; the socket is closed then with code 1006, which is
-/// without a close frame.
-pub fn react(text: &str, numbers: Numbers) -> Result<Reaction, &'static str> {
+///
+/// The reason for which its decoder or parser throws. The socket then closes with code 1006: without a close frame.
+pub fn react(text: &str, numbers: NumberStyle) -> Result<Reaction, &'static str> {
     let mut chars = text.chars();
     let Some(engine) = chars.next().and_then(|c| c.to_digit(10)) else {
         return Err("a message that does not begin with a digit");
@@ -72,7 +63,7 @@ pub fn react(text: &str, numbers: Numbers) -> Result<Reaction, &'static str> {
 }
 
 /// `[name, data]` behind an optional namespace and number.
-fn event(rest: &str, numbers: Numbers) -> Result<Reaction, &'static str> {
+fn event(rest: &str, numbers: NumberStyle) -> Result<Reaction, &'static str> {
     let rest = match rest.strip_prefix('/') {
         Some(named) => named.split_once(',').map_or("", |(_, rest)| rest),
         None => rest,
@@ -99,16 +90,16 @@ fn event(rest: &str, numbers: Numbers) -> Result<Reaction, &'static str> {
     })
 }
 
-fn steer(data: Option<&Value>, numbers: Numbers) -> Steer {
+fn steer(data: Option<&Value>, numbers: NumberStyle) -> Steer {
     let read = |name: &str| {
         let value = data?.get(name)?;
         match (numbers, value) {
-            (Numbers::Strings(mark), Value::String(text)) => float_parse(text, mark),
-            (Numbers::Json, Value::Number(number)) => number.as_f64().map(|number| number as f32),
+            (NumberStyle::Strings(mark), Value::String(text)) => float_parse(text, mark),
+            (NumberStyle::Json, Value::Number(number)) => number.as_f64().map(|number| number as f32),
             _ => None,
         }
     };
-    let bias = if numbers == Numbers::Json { TERM_2_BIAS } else { 0.0 };
+    let bias = if numbers == NumberStyle::Json { TERM_2_BIAS } else { 0.0 };
     let steering = read("steering_angle").map(|steering| steering + bias);
     Steer { steering, throttle: steering.and_then(|_| read("throttle")) }
 }
@@ -141,7 +132,7 @@ fn float_parse(text: &str, mark: DecimalMark) -> Option<f32> {
             _ => return None,
         }
     }
-    // A number beyond the range of a float throws, too.
+    // The original also throws for a number beyond the range of a float.
     plain.parse().ok().filter(|value: &f32| value.is_finite())
 }
 
@@ -149,10 +140,10 @@ fn float_parse(text: &str, mark: DecimalMark) -> Option<f32> {
 mod tests {
     use super::*;
 
-    const DOT: Numbers = Numbers::Strings(DecimalMark::DOT);
-    const COMMA: Numbers = Numbers::Strings(DecimalMark::COMMA);
+    const DOT: NumberStyle = NumberStyle::Strings(DecimalMark::DOT);
+    const COMMA: NumberStyle = NumberStyle::Strings(DecimalMark::COMMA);
 
-    fn steer(text: &str, numbers: Numbers) -> (Option<f32>, Option<f32>) {
+    fn steer(text: &str, numbers: NumberStyle) -> (Option<f32>, Option<f32>) {
         match react(text, numbers).unwrap() {
             Reaction::Steer(Steer { steering, throttle }) => (steering, throttle),
             other => panic!("{text}: {other:?}"),
@@ -213,8 +204,8 @@ mod tests {
         let plain = r#"42["steer",{"steering_angle":-0.0312,"throttle":0.25}]"#;
         assert_eq!(steer(strings, DOT), (Some(-0.0312), Some(0.25)));
         assert_eq!(steer(plain, DOT), (None, None));
-        assert_eq!(steer(plain, Numbers::Json), (Some(-0.0312 + 0.017_453_292), Some(0.25)));
-        assert_eq!(steer(strings, Numbers::Json), (None, None));
+        assert_eq!(steer(plain, NumberStyle::Json), (Some(-0.0312 + 0.017_453_292), Some(0.25)));
+        assert_eq!(steer(strings, NumberStyle::Json), (None, None));
         assert_eq!(steer(r#"42["steer",{"steering_angle":"0.5"}]"#, DOT), (Some(0.5), None));
         assert_eq!(steer(r#"42["steer",{"throttle":"0.5"}]"#, DOT), (None, None));
         assert_eq!(steer(r#"42["steer",{"steering_angle":"0.5","throttle":"nan"}]"#, DOT), (Some(0.5), None));
