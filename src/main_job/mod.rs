@@ -12,7 +12,7 @@ use serde::Serialize;
 use crate::error::{Error, Result};
 use crate::files::new_folder::NewFolder;
 use crate::pilot::Pilot;
-use crate::report::map;
+use crate::report::charts::map;
 use crate::simulator::camera::eye::Eye;
 use crate::simulator::recorder::record::drive_expert;
 use crate::simulator::trial::drive::drive;

@@ -49,7 +49,7 @@ pub(super) struct Number {
 }
 
 impl Number {
-    fn read(text: &str) -> Number {
+    pub(super) fn read(text: &str) -> Number {
         // Longer than any number with four decimals or in its shortest decimal form.
         const MAX_LEN: usize = 400;
         let mut plain = [0; MAX_LEN];

@@ -4,10 +4,10 @@
 use rayon::prelude::*;
 use serde::Serialize;
 
-use super::footage::{Footage, Projector};
-use crate::dataset::decode::RgbImage;
 use crate::error::{Error, Result};
+use crate::picture::RgbImage;
 use crate::pilot::Pilot;
+use crate::report::explain::footage::{Footage, Projector};
 
 /// Where the horizon of Udacity's camera lies, as a share of the height.
 const HORIZON: f64 = 0.355;
