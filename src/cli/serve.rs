@@ -1,6 +1,6 @@
 //! `steersman serve`: drives Udacity's simulator, or any client that speaks its protocol.
 
-use std::io::{IsTerminal, Write as _};
+use std::io::IsTerminal;
 use std::net::{IpAddr, SocketAddr};
 use std::path::PathBuf;
 use std::sync::Mutex;
@@ -12,8 +12,13 @@ use indicatif::{ProgressBar, ProgressStyle};
 use super::{or_dash, print_json, stop_on_ctrl_c};
 use crate::error::{Error, Result};
 use crate::pilot::Pilot;
+<<<<<<< HEAD
 use crate::serve::{Console, HelmOptions, Server, ServerOptions, Summary};
 use crate::udacity;
+=======
+use crate::serve::{Console, HelmOptions, Server, ServerOptions, Summary, protocol};
+use crate::text::escaped;
+>>>>>>> main
 
 /// Drive Udacity's simulator with a model; it connects by itself in autonomous mode
 #[derive(Debug, Args)]
@@ -112,7 +117,7 @@ fn print_summary(summary: &Summary) {
 
 /// Writes a line to standard error. Whoever reads it may have left, as in `2>&1 | head`; the car is driven on.
 fn say(text: &str) {
-    let _ = writeln!(std::io::stderr(), "{text}");
+    eprintln!("{text}");
 }
 
 /// Standard error: on a terminal the status stays in the last line, elsewhere it is written now and then.
@@ -148,7 +153,7 @@ impl Console for Screen {
 
     fn status(&self, text: &str) {
         if let Some(bar) = &self.bar {
-            bar.set_message(text.to_owned());
+            bar.set_message(escaped(text).into_owned());
             bar.tick();
             return;
         }
