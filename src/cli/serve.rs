@@ -12,13 +12,9 @@ use indicatif::{ProgressBar, ProgressStyle};
 use super::{or_dash, print_json, stop_on_ctrl_c};
 use crate::error::{Error, Result};
 use crate::pilot::Pilot;
-<<<<<<< HEAD
 use crate::serve::{Console, HelmOptions, Server, ServerOptions, Summary};
-use crate::udacity;
-=======
-use crate::serve::{Console, HelmOptions, Server, ServerOptions, Summary, protocol};
 use crate::text::escaped;
->>>>>>> main
+use crate::udacity;
 
 /// Drive Udacity's simulator with a model; it connects by itself in autonomous mode
 #[derive(Debug, Args)]
