@@ -131,8 +131,8 @@ fn after_a_change_of_scene_the_drive_begins_anew() {
 fn in_real_time_it_drives_as_well_and_reports_latencies() {
     let folder = folder_with_model();
     let served = serve(&folder, &[]);
-    let pace = TimeMode::RealTime { fps: 30.0 };
-    let report = drive_lake(&ClientOptions { pace, frames: Some(40), ..lockstep(&served) });
+    let time_mode = TimeMode::RealTime { fps: 30.0 };
+    let report = drive_lake(&ClientOptions { time_mode, frames: Some(40), ..lockstep(&served) });
     assert_eq!((report.commands, report.round_trips_ms.len(), report.tokens_lost), (40, 40, 0));
     let (summary, _) = served.stop();
     let ms = |name: &str| summary[name].as_f64().unwrap();
