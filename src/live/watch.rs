@@ -1,17 +1,17 @@
 //! Shows a closed-loop drive in real time.
 
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use super::messages::State;
 use super::real_time::RealTime;
 use super::server::Live;
-use crate::error::{Error, Result};
+use crate::error::Result;
+use crate::observer::{Observer, StopSignal};
 use crate::picture::RgbImage;
 use crate::pilot::Pilot;
 use crate::report::explain::saliency::Saliency;
 use crate::simulator::camera::jpeg;
-use crate::simulator::{DriveFrame, DriveObserver, HEIGHT, RunOptions, WIDTH};
+use crate::simulator::{DriveEvent, DriveFrame, HEIGHT, RunOptions, WIDTH};
 
 /// Longest time until a wait notices that it has to end.
 const TICK: Duration = Duration::from_millis(50);
@@ -19,7 +19,7 @@ const TICK: Duration = Duration::from_millis(50);
 /// Shows the runs of a drive on a page, in real time.
 pub struct Watch<'a> {
     live: &'a Live,
-    stop: &'a AtomicBool,
+    stop: &'a StopSignal,
     driver: &'a str,
     /// A copy of the pilot, and its saliency. The driver itself is left alone, so that its drive stays the same.
     saliency: Option<(Pilot, Saliency)>,
@@ -35,8 +35,8 @@ pub struct Watch<'a> {
 }
 
 impl<'a> Watch<'a> {
-    /// Shows `runs` seeds of `driver` on `live` until `stop` is set. `pilot` is the model that drives, if any.
-    pub fn new(live: &'a Live, driver: &'a str, pilot: Option<&Pilot>, runs: usize, stop: &'a AtomicBool) -> Watch<'a> {
+    /// Shows `runs` seeds of `driver` on `live` until `stop` is requested. `pilot` is the model that drives, if any.
+    pub fn new(live: &'a Live, driver: &'a str, pilot: Option<&Pilot>, runs: usize, stop: &'a StopSignal) -> Watch<'a> {
         // A network without a convolution has no saliency.
         let saliency = pilot.and_then(|pilot| Some((pilot.clone(), Saliency::new(pilot.network()).ok()?)));
         Watch {
@@ -59,9 +59,7 @@ impl<'a> Watch<'a> {
     fn wait(&mut self, time_s: f64) -> Result<()> {
         let real_time = self.real_time.get_or_insert_with(|| RealTime::start(Instant::now()));
         loop {
-            if self.stop.load(Ordering::Relaxed) {
-                return Err(Error::Interrupted);
-            }
+            self.stop.check()?;
             let left = real_time.until(time_s, Instant::now());
             if left.is_zero() {
                 return Ok(());
@@ -71,7 +69,17 @@ impl<'a> Watch<'a> {
     }
 }
 
-impl DriveObserver for Watch<'_> {
+impl<'e> Observer<DriveEvent<'e>> for Watch<'_> {
+    fn observe(&mut self, event: DriveEvent<'e>) -> Result<()> {
+        match event {
+            DriveEvent::Begin { seed, options } => self.begin(seed, options),
+            DriveEvent::Frame(frame) => return self.frame(frame),
+        }
+        Ok(())
+    }
+}
+
+impl Watch<'_> {
     fn begin(&mut self, seed: u64, options: &RunOptions) {
         self.begun += usize::from(self.seed != Some(seed));
         (self.seed, self.real_time, self.trail_id) = (Some(seed), None, self.trail_id + 1);

@@ -6,8 +6,10 @@ use std::time::{Duration, Instant};
 
 use serde::Serialize;
 
-use super::console::Console;
+use super::server_event::ServeEvent;
+use crate::observer::Observer;
 use crate::text::escaped;
+use crate::{Error, Result};
 
 /// Average time between two reports of one kind of incident.
 const INTERVAL: Duration = Duration::from_secs(5);
@@ -120,9 +122,15 @@ impl Incident {
     }
 }
 
+/// The observer, and the error with which it ended the log.
+struct Observed<'a> {
+    observer: &'a mut (dyn Observer<ServeEvent> + Send),
+    error: Option<Error>,
+}
+
 /// The log. It escapes every line, so bytes of a client never reach the terminal raw.
 pub struct Journal<'a> {
-    console: &'a dyn Console,
+    observer: Mutex<Observed<'a>>,
     check: bool,
     entries: Mutex<BTreeMap<Incident, Entry>>,
 }
@@ -152,9 +160,35 @@ impl Entry {
 }
 
 impl<'a> Journal<'a> {
-    /// A log that writes to `console`; with `check` it also shows every step and message.
-    pub fn new(console: &'a dyn Console, check: bool) -> Journal<'a> {
-        Journal { console, check, entries: Mutex::default() }
+    /// A log that tells `observer`; with `check` it also tells every step and message.
+    pub fn new(observer: &'a mut (dyn Observer<ServeEvent> + Send), check: bool) -> Journal<'a> {
+        Journal { observer: Mutex::new(Observed { observer, error: None }), check, entries: Mutex::default() }
+    }
+
+    fn tell(&self, event: ServeEvent) {
+        let mut observed = self.observer.lock().unwrap_or_else(PoisonError::into_inner);
+        if observed.error.is_none() {
+            observed.error = observed.observer.observe(event).err();
+        }
+    }
+
+    /// Shows the status line.
+    pub fn status(&self, text: String) {
+        self.tell(ServeEvent::Status(text));
+    }
+
+    /// Whether the observer has returned an error. It then gets no more events.
+    pub fn failed(&self) -> bool {
+        self.observer.lock().unwrap_or_else(PoisonError::into_inner).error.is_some()
+    }
+
+    /// Ends the log.
+    ///
+    /// # Errors
+    ///
+    /// The first error of the observer.
+    pub fn into_result(self) -> Result<()> {
+        self.observer.into_inner().unwrap_or_else(PoisonError::into_inner).error.map_or(Ok(()), Err)
     }
 
     /// Shows `detail` and the remedy of `incident`, and limits how often it does so for each kind.
@@ -186,7 +220,7 @@ impl<'a> Journal<'a> {
     }
 
     fn line(&self, text: &str) {
-        self.console.line(&escaped(text));
+        self.tell(ServeEvent::Line(escaped(text).into_owned()));
     }
 
     /// Whether `check` is on.
@@ -205,43 +239,59 @@ impl<'a> Journal<'a> {
 mod tests {
     use super::*;
 
-    #[derive(Default)]
-    struct Lines(Mutex<Vec<String>>);
-
-    impl Console for Lines {
-        fn line(&self, text: &str) {
-            self.0.lock().unwrap().push(text.into());
-        }
-
-        fn status(&self, _: &str) {}
+    /// The lines of `work` on a log.
+    fn lines_of(check: bool, work: impl FnOnce(&Journal)) -> Vec<String> {
+        let mut lines = Vec::new();
+        let mut observer = |event| {
+            match event {
+                ServeEvent::Line(text) => lines.push(text),
+                ServeEvent::Status(_) => {}
+            }
+            Ok(())
+        };
+        let journal = Journal::new(&mut observer, check);
+        work(&journal);
+        assert!(!journal.failed() && journal.into_result().is_ok());
+        lines
     }
 
     #[test]
     fn a_flood_of_one_incident_is_a_few_lines_and_hides_no_other() {
-        let lines = Lines::default();
-        let journal = Journal::new(&lines, false);
-        for k in 0..1000 {
-            journal.report(Incident::UnreadableImage, format_args!("picture {k}"));
-        }
-        journal.report(Incident::NoSpeed, format_args!("telemetry without a speed"));
-        journal.step(format_args!("not shown"));
-        let lines = lines.0.lock().unwrap();
+        let lines = lines_of(false, |journal| {
+            for k in 0..1000 {
+                journal.report(Incident::UnreadableImage, format_args!("picture {k}"));
+            }
+            journal.report(Incident::NoSpeed, format_args!("telemetry without a speed"));
+            journal.step(format_args!("not shown"));
+            assert_eq!(journal.counts()[&Incident::UnreadableImage], 1000);
+        });
         assert_eq!(lines.len(), BURST as usize + 1, "{lines:?}");
+        assert!(lines[0].starts_with("picture 0: "), "{lines:?}");
         let (mut entry, now) = (Entry::default(), Instant::now());
         let shown = (0..6000).filter(|ms| entry.admit(now + Duration::from_millis(*ms * 10))).count();
         assert_eq!(shown as u32, BURST + 11, "in a minute");
-        assert!(lines[0].starts_with("picture 0: the throttle is cut"), "{lines:?}");
-        assert_eq!(journal.counts()[&Incident::UnreadableImage], 1000);
     }
 
     #[test]
     fn bytes_of_a_client_never_reach_the_terminal_raw() {
-        let lines = Lines::default();
-        let journal = Journal::new(&lines, true);
-        journal.report(Incident::NotSocketIo, format_args!("a packet \u{1b}[2J\u{9b}31m\u{202e}"));
-        journal.step(format_args!("a step \r\n\u{7}"));
-        let lines = lines.0.lock().unwrap();
+        let lines = lines_of(true, |journal| {
+            journal.report(Incident::NotSocketIo, format_args!("a packet \u{1b}[2J\u{9b}31m\u{202e}"));
+            journal.step(format_args!("a step \r\n\u{7}"));
+        });
         assert!(lines[0].starts_with("a packet \\u{1b}[2J\\u{9b}31m\\u{202e}: "), "{lines:?}");
         assert_eq!(lines[1], "a step \\r\\n\\u{7}");
+    }
+
+    #[test]
+    fn an_observer_that_fails_gets_no_more_events_and_its_error_is_kept() {
+        let mut told = 0;
+        let mut observer = |_| {
+            told += 1;
+            Err(Error::Interrupted)
+        };
+        let journal = Journal::new(&mut observer, true);
+        (0..3).for_each(|k| journal.step(format_args!("step {k}")));
+        assert!(journal.failed() && matches!(journal.into_result(), Err(Error::Interrupted)));
+        assert_eq!(told, 1);
     }
 }

@@ -9,21 +9,20 @@
 //! drives only a client that has sent a complete state of its car.
 //!
 //! ```no_run
-//! use std::{path::Path, sync::atomic::AtomicBool};
+//! use std::path::Path;
+//! use steersman::observer::StopSignal;
 //! use steersman::pilot::Pilot;
-//! use steersman::serve::{Console, Server, ServerOptions};
-//!
-//! struct Terminal;
-//! impl Console for Terminal {
-//!     fn line(&self, text: &str) {
-//!         eprintln!("{text}");
-//!     }
-//!     fn status(&self, _: &str) {}
-//! }
+//! use steersman::serve::{ServeEvent, Server, ServerOptions};
 //!
 //! let pilot = Pilot::load(Path::new("runs/default-1/model.safetensors"))?;
-//! let stop = AtomicBool::new(false);
-//! let summary = Server::bind(ServerOptions::default())?.run(pilot, &Terminal, &stop)?;
+//! let mut observer = |event| {
+//!     if let ServeEvent::Line(text) = event {
+//!         eprintln!("{text}");
+//!     }
+//!     Ok(())
+//! };
+//! let stop = StopSignal::default(); // a request from elsewhere ends the server
+//! let summary = Server::bind(ServerOptions::default())?.run(pilot, &mut observer, &stop)?;
 //! println!("{} frames answered", summary.frames);
 //! # Ok::<(), steersman::Error>(())
 //! ```
@@ -31,7 +30,6 @@
 //! [`Pilot`]: crate::pilot::Pilot
 
 mod connection;
-mod console;
 mod handshake;
 mod helm;
 mod journal;
@@ -41,14 +39,15 @@ mod rate_limit;
 mod recording;
 mod seat;
 mod server;
+mod server_event;
 mod shared;
 mod statistics;
 mod tokens;
 
-pub use console::Console;
 pub use helm::HelmOptions;
 pub use journal::Incident;
 pub use options::ServerOptions;
 pub use recording::Recorded;
 pub use server::Server;
+pub use server_event::ServeEvent;
 pub use statistics::Summary;

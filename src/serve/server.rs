@@ -8,16 +8,17 @@ use std::thread::Scope;
 use std::time::{Duration, Instant};
 
 use super::connection;
-use super::console::Console;
 use super::journal::{Incident, Journal};
 use super::options::ServerOptions;
 use super::recording::Recorder;
 use super::seat::Seat;
+use super::server_event::ServeEvent;
 use super::shared::Shared;
 use super::statistics::Summary;
 use crate::error::{Error, Result};
 use crate::net::connections::Connections;
 use crate::net::http;
+use crate::observer::{Observer, StopSignal};
 use crate::pilot::Pilot;
 
 /// Largest number of open connections.
@@ -64,43 +65,49 @@ impl Server {
         self.listener.local_addr().map_err(|e| Error::System(format!("cannot tell the address: {e}")))
     }
 
-    /// Serves until `stop` is set, and then cuts the throttle of the driven car.
+    /// Serves until `stop` is requested, and then cuts the throttle of the driven car.
     ///
     /// # Errors
     ///
-    /// If a recording cannot be written.
-    pub fn run(self, pilot: Pilot, console: &dyn Console, stop: &AtomicBool) -> Result<Summary> {
+    /// If a recording cannot be written, and the error of the observer, which also ends the serving.
+    pub fn run(
+        self,
+        pilot: Pilot,
+        observer: &mut (dyn Observer<ServeEvent> + Send),
+        stop: &StopSignal,
+    ) -> Result<Summary> {
         let Server { listener, options, recorder } = self;
         let shared = Shared {
             options: &options,
             pilot: Mutex::new(pilot),
             seat: Seat::default(),
-            journal: Journal::new(console, options.check),
+            journal: Journal::new(observer, options.check),
             recorder,
             recording_failed: AtomicBool::new(false),
             stop,
             connections: Connections::new(MAX_CONNECTIONS),
             statistics: Mutex::default(),
         };
-        let connections = std::thread::scope(|scope| listen(&listener, scope, &shared, console));
+        let connections = std::thread::scope(|scope| listen(&listener, scope, &shared));
         let incidents = shared.journal.counts();
         let recorded = shared.recorder.map(Recorder::finish).transpose()?;
+        shared.journal.into_result()?;
         let statistics = shared.statistics.into_inner().unwrap_or_else(PoisonError::into_inner);
         Ok(statistics.summary(connections, incidents, recorded))
     }
 }
 
-/// Accepts connections until `stop` is set. Returns their number.
-fn listen<'scope, 'env>(
+/// Accepts connections until `stop` is requested. Returns their number.
+fn listen<'scope, 'env, 'o>(
     listener: &TcpListener,
     scope: &'scope Scope<'scope, 'env>,
-    shared: &'env Shared<'env>,
-    console: &dyn Console,
+    shared: &'env Shared<'o>,
 ) -> u64 {
     let began = Instant::now();
     let (mut connections, mut nobody_yet) = (0, true);
     let mut last_status = began;
-    while !shared.stop.load(Ordering::Relaxed) && !shared.recording_failed.load(Ordering::Relaxed) {
+    let failed = || shared.recording_failed.load(Ordering::Relaxed) || shared.journal.failed();
+    while !shared.stop.requested() && !failed() {
         match listener.accept() {
             Ok((stream, address)) => {
                 connections += 1;
@@ -115,7 +122,7 @@ fn listen<'scope, 'env>(
             last_status = Instant::now();
             let status = shared.statistics().status(since.as_secs_f64());
             if let Some(status) = status {
-                console.status(&status);
+                shared.journal.status(status);
             }
             if nobody_yet && began.elapsed() >= NOBODY_TIME {
                 nobody_yet = false;
@@ -124,13 +131,13 @@ fn listen<'scope, 'env>(
         }
     }
     // The threads of the connections check `stop`; a failed recording ends them, too.
-    shared.stop.store(true, Ordering::Relaxed);
+    shared.stop.request();
     connections
 }
 
-fn admit<'scope, 'env>(
+fn admit<'scope, 'env, 'o>(
     scope: &'scope Scope<'scope, 'env>,
-    shared: &'env Shared<'env>,
+    shared: &'env Shared<'o>,
     id: u64,
     stream: TcpStream,
     address: SocketAddr,

@@ -9,6 +9,7 @@ use super::recording::Recorder;
 use super::seat::Seat;
 use super::statistics::Statistics;
 use crate::net::connections::Connections;
+use crate::observer::StopSignal;
 use crate::pilot::Pilot;
 
 /// What the threads of a server share.
@@ -19,7 +20,7 @@ pub(super) struct Shared<'a> {
     pub journal: Journal<'a>,
     pub recorder: Option<Recorder>,
     pub recording_failed: AtomicBool,
-    pub stop: &'a AtomicBool,
+    pub stop: &'a StopSignal,
     pub connections: Connections,
     pub statistics: Mutex<Statistics>,
 }

@@ -25,5 +25,5 @@ mod scene;
 mod server_url;
 
 pub use options::{ClientOptions, ClientReport, TimeMode};
-pub use scene::{Observer, drive};
+pub use scene::{ClientEvent, drive};
 pub use server_url::ServerUrl;

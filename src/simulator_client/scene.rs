@@ -8,6 +8,7 @@ use super::frame_clock::FrameClock;
 use super::link::{LinkEvent, ServerLink};
 use super::options::{ClientOptions, ClientReport, TimeMode};
 use super::reaction::Steer;
+use crate::observer::{Observer, Progress};
 use crate::simulator::camera::eye::Eye;
 use crate::simulator::car::dynamics::MAX_STEER_DEG;
 use crate::simulator::car::expert::pursuit;
@@ -24,12 +25,13 @@ const TICK_S: f64 = 0.1;
 /// Time for which the same notice is not repeated.
 const SAME_NOTICE: Duration = Duration::from_secs(5);
 
-/// Follows the drive.
-pub trait Observer {
+/// What happens during a drive.
+#[derive(Clone, Debug, PartialEq)]
+pub enum ClientEvent {
     /// A notice for the user: connected, disconnected, a reply that cannot be read.
-    fn notice(&mut self, text: &str);
-    /// The share of the distance that is driven, 0 to 1. `false` stops the drive.
-    fn progress(&mut self, share: f64) -> bool;
+    Notice(String),
+    /// The share of the distance that is driven.
+    Progress(Progress),
 }
 
 /// Drives on `track` with the commands of the server in `options`.
@@ -37,13 +39,13 @@ pub trait Observer {
 /// # Errors
 ///
 /// [`Error::Usage`] for impossible options, [`Error::Connection`] if the server does not reply for longer than `patience_s`,
-/// [`Error::Interrupted`] if `observer` stopped it.
-pub fn drive(track: &Track, options: &ClientOptions, observer: &mut dyn Observer) -> Result<ClientReport> {
+/// and the error of `observer`.
+pub fn drive(track: &Track, options: &ClientOptions, observer: &mut dyn Observer<ClientEvent>) -> Result<ClientReport> {
     options.check()?;
     let mut scene = Scene::new(track, options, observer);
     let driven = match options.scene_change_s {
         Some(_) => scene.play(options.scene_change_s).and_then(|_| {
-            scene.change();
+            scene.change()?;
             scene.play(None)
         }),
         None => scene.play(None),
@@ -66,7 +68,7 @@ struct Sent {
 struct Scene<'a> {
     track: &'a Track,
     options: &'a ClientOptions,
-    observer: &'a mut dyn Observer,
+    observer: &'a mut dyn Observer<ClientEvent>,
     link: ServerLink,
     eye: Eye<'a>,
     /// The picture in base64.
@@ -96,7 +98,7 @@ struct Scene<'a> {
 }
 
 impl<'a> Scene<'a> {
-    fn new(track: &'a Track, options: &'a ClientOptions, observer: &'a mut dyn Observer) -> Scene<'a> {
+    fn new(track: &'a Track, options: &'a ClientOptions, observer: &'a mut dyn Observer<ClientEvent>) -> Scene<'a> {
         // Building the world takes a while, and the server waits for the first telemetry.
         let eye = Eye::new(track, options.seed);
         Scene {
@@ -122,13 +124,15 @@ impl<'a> Scene<'a> {
     }
 
     /// Leaves the scene and enters it again.
-    fn change(&mut self) {
-        self.observer.notice("the scene changes: the connection ends without a close frame");
+    fn change(&mut self) -> Result<()> {
+        let notice = "the scene changes: the connection ends without a close frame".into();
+        self.observer.observe(ClientEvent::Notice(notice))?;
         let link = ServerLink::start(&self.options.url, self.options.numbers, self.options.seed);
         let left = std::mem::replace(&mut self.link, link);
         self.connections += left.count();
         left.abort();
         (self.due, self.command, self.sent, self.image_step) = (0, (0.0, 0.0), None, None);
+        Ok(())
     }
 
     /// Drives from the start to the end of the run, or until the scene is left.
@@ -159,7 +163,8 @@ impl<'a> Scene<'a> {
         }
         if closed_loop.is_too_slow() {
             let time_s = closed_loop.simulation().time_s();
-            self.observer.notice(&format!("the run ends after {time_s:.0} s: the car is far too slow for its laps"));
+            let notice = format!("the run ends after {time_s:.0} s: the car is far too slow for its laps");
+            self.observer.observe(ClientEvent::Notice(notice))?;
         }
         Ok(closed_loop.finish())
     }
@@ -180,7 +185,7 @@ impl<'a> Scene<'a> {
     /// Sends telemetry for every token and waits for a reply to it.
     fn exchange(&mut self, closed_loop: &ClosedLoop) -> Result<()> {
         while let Some(event) = self.link.poll() {
-            self.take(event);
+            self.handle(event)?;
         }
         loop {
             self.wait_for_turn()?;
@@ -212,10 +217,10 @@ impl<'a> Scene<'a> {
         let event = self.link.wait(Duration::from_secs_f64(TICK_S));
         let waited_s = began.elapsed().as_secs_f64().min(TICK_S);
         if let Some(event) = event {
-            self.take(event);
+            self.handle(event)?;
         }
         self.be_patient(waited_s)?;
-        if self.observer.progress(self.share) { Ok(()) } else { Err(Error::Interrupted) }
+        self.observer.observe(ClientEvent::Progress(Progress(self.share)))
     }
 
     /// One rendered frame of Unity: first the physics steps that are due, then the events, then the telemetry.
@@ -233,7 +238,7 @@ impl<'a> Scene<'a> {
         }
         self.be_patient(passed_s.min(TICK_S))?;
         while let Some(event) = self.link.poll() {
-            self.take(event);
+            self.handle(event)?;
         }
         while self.due > 0 {
             self.send_telemetry(closed_loop)?;
@@ -244,7 +249,7 @@ impl<'a> Scene<'a> {
 
     fn progress(&mut self, closed_loop: &ClosedLoop) -> Result<()> {
         self.share = closed_loop.share();
-        if self.observer.progress(self.share) { Ok(()) } else { Err(Error::Interrupted) }
+        self.observer.observe(ClientEvent::Progress(Progress(self.share)))
     }
 
     /// Adds `more_s` to the time without a reply, and gives up after `patience_s`.
@@ -269,7 +274,7 @@ impl<'a> Scene<'a> {
     }
 
     /// Handles an event of the connection.
-    fn take(&mut self, event: LinkEvent) {
+    fn handle(&mut self, event: LinkEvent) -> Result<()> {
         match event {
             LinkEvent::Open => {
                 if self.since.is_none() {
@@ -288,7 +293,7 @@ impl<'a> Scene<'a> {
                     }
                     None => {
                         self.report.tokens_lost += 1;
-                        self.notice("a command cannot be read: the simulator sends no telemetry for it".into());
+                        self.notice("a command cannot be read: the simulator sends no telemetry for it".into())?;
                     }
                 }
             }
@@ -301,23 +306,25 @@ impl<'a> Scene<'a> {
             }
             LinkEvent::Closed(why) => {
                 self.sent = None;
-                self.notice(format!("{why}; connecting again"));
+                self.notice(format!("{why}; connecting again"))?;
                 self.trouble = why;
             }
             LinkEvent::Unreachable(why) => {
-                self.notice(format!("{}: {why}; trying again", self.options.url));
+                self.notice(format!("{}: {why}; trying again", self.options.url))?;
                 self.trouble = why;
             }
         }
+        Ok(())
     }
 
     /// Tells the observer, unless the notice is the same as the last one.
-    fn notice(&mut self, text: String) {
+    fn notice(&mut self, text: String) -> Result<()> {
         let again = |(last, at): &(String, Instant)| *last == text && at.elapsed() < SAME_NOTICE;
         if !self.noticed.as_ref().is_some_and(again) {
-            self.observer.notice(&text);
+            self.observer.observe(ClientEvent::Notice(text.clone()))?;
             self.noticed = Some((text, Instant::now()));
         }
+        Ok(())
     }
 
     fn reply(&mut self, arrived: Instant) {

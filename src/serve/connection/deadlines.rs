@@ -18,7 +18,7 @@ const MISSING_TIME: Duration = Duration::from_secs(5);
 /// Longest time without a complete message, for a client that is not driven or does not answer pings.
 const MAX_SILENCE: Duration = Duration::from_millis(PING_INTERVAL_MS + PING_TIMEOUT_MS);
 
-impl Connection<'_> {
+impl Connection<'_, '_> {
     /// Does what is due after each tick, apart from messages.
     pub(super) fn after_tick(&mut self) -> Result<(), End> {
         if let Some((text, came)) = self.held.take() {

@@ -21,7 +21,7 @@ const STRONG_THROTTLE: f32 = 0.2;
 /// Number of commands with a strong throttle after which a car must follow.
 const MAX_IGNORED: u32 = 40;
 
-impl Connection<'_> {
+impl Connection<'_, '_> {
     /// Answers the newest telemetry, whose last byte arrived at `arrived`.
     pub(super) fn answer(&mut self, packet: ClientPacket, arrived: Instant) -> Result<(), End> {
         let telemetry = match packet {

@@ -7,7 +7,6 @@ mod opening;
 use std::net::SocketAddr;
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::sync::Arc;
-use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use tungstenite::{Message, Utf8Bytes, WebSocket};
@@ -86,8 +85,8 @@ pub(super) fn serve(shared: &Shared, peer: &Arc<Peer>, address: SocketAddr) {
 }
 
 /// A WebSocket and what the server knows of the client behind it.
-struct Connection<'a> {
-    shared: &'a Shared<'a>,
+struct Connection<'a, 'o> {
+    shared: &'a Shared<'o>,
     peer: &'a Arc<Peer>,
     address: SocketAddr,
     websocket: WebSocket<Socket>,
@@ -126,11 +125,11 @@ struct Connection<'a> {
     reply: String,
 }
 
-impl Connection<'_> {
+impl Connection<'_, '_> {
     fn run(&mut self) -> Result<(), End> {
         let mut batch = Vec::with_capacity(MAX_BATCH);
         loop {
-            if self.shared.stop.load(Ordering::Relaxed) {
+            if self.shared.stop.requested() {
                 return Ok(());
             }
             self.websocket.get_mut().begin_tick();
@@ -173,7 +172,7 @@ impl Connection<'_> {
         const STEP: Duration = Duration::from_millis(5);
         let now = Instant::now();
         let until = now + self.rate_limit.charge(messages, bytes, now);
-        while !self.shared.stop.load(Ordering::Relaxed) && !self.peer.must_close() {
+        while !self.shared.stop.requested() && !self.peer.must_close() {
             let left = until.saturating_duration_since(Instant::now());
             if left.is_zero() {
                 return;
