@@ -5,7 +5,7 @@ use std::hash::{DefaultHasher, Hash, Hasher};
 
 use rayon::prelude::*;
 
-use super::super::recording::{Camera, Recording};
+use crate::dataset::recording::{Recording, View};
 use crate::picture::{RgbImage, decode::decode_rgb};
 
 /// Rows that a thread looks at in one go.
@@ -129,7 +129,7 @@ struct Eye {
 impl Eye {
     fn look(&mut self, recording: &Recording, row: usize) -> Option<Sketch> {
         use std::io::Read as _;
-        let path = recording.image_path(row, Camera::Centre)?;
+        let path = recording.image_path(row, View::Centre)?;
         self.file.clear();
         std::fs::File::open(path).ok()?.read_to_end(&mut self.file).ok()?;
         decode_rgb(&self.file, &mut self.image).ok()?;
