@@ -166,8 +166,10 @@ pub mod recipe;
 pub mod report;
 pub mod serve;
 pub mod simulator;
+pub mod simulator_client;
 mod statistics;
 mod text;
 pub mod training;
+pub mod udacity;
 
 pub use error::{Error, Result};
