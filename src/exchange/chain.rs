@@ -6,7 +6,7 @@ use crate::error::{Error, Result};
 
 /// One operation of the chain.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) struct Step {
+pub(crate) struct ChainStep {
     /// Name of the layer.
     pub name: String,
     pub input: Shape,
@@ -85,10 +85,10 @@ pub(crate) struct Pads {
 }
 
 /// The operations of `network` with `parameters`; layers that do nothing in evaluation are left out.
-pub(crate) fn chain(network: &Network, parameters: &Parameters) -> Vec<Step> {
+pub(crate) fn chain(network: &Network, parameters: &Parameters) -> Vec<ChainStep> {
     let step = |layer: &NamedLayer| {
         let op = op(layer, parameters)?;
-        Some(Step { name: layer.name.clone(), input: layer.layer.input(), output: layer.layer.output(), op })
+        Some(ChainStep { name: layer.name.clone(), input: layer.layer.input(), output: layer.layer.output(), op })
     };
     network.layers().iter().filter_map(step).collect()
 }
@@ -137,25 +137,31 @@ fn op(layer: &NamedLayer, parameters: &Parameters) -> Option<Op> {
 }
 
 /// Batch normalisation of evaluation is `x · scale + shift` in each channel.
-pub(crate) fn scale_and_shift(gamma: &[f32], beta: &[f32], mean: &[f32], variance: &[f32], epsilon: f32) -> Affine {
+pub(crate) fn scale_and_shift(
+    gamma: &[f32],
+    beta: &[f32],
+    mean: &[f32],
+    variance: &[f32],
+    epsilon: f32,
+) -> ChannelAffine {
     let channel = |i: usize| {
         let scale = f64::from(gamma[i]) / (f64::from(variance[i]) + f64::from(epsilon)).sqrt();
         (scale, f64::from(beta[i]) - f64::from(mean[i]) * scale)
     };
     let (scale, shift) = (0..gamma.len()).map(channel).unzip();
-    Affine { scale, shift }
+    ChannelAffine { scale, shift }
 }
 
 /// Refuses numbers that are not finite, which a file of an exported model could not say or would compute nonsense with: those
 /// that folding made, and the scales and shifts of the batch normalisation that is left, as the 32-bit numbers they become.
-pub(crate) fn check_finite(steps: &[Step]) -> Result<()> {
-    for Step { name, op, .. } in steps {
+pub(crate) fn check_finite(steps: &[ChainStep]) -> Result<()> {
+    for ChainStep { name, op, .. } in steps {
         let is_finite = match op {
             Op::Conv { weight, bias, .. } | Op::Dense { weight, bias } => {
                 weight.iter().chain(bias).all(|value| value.is_finite())
             }
             Op::BatchNorm { gamma, beta, mean, variance, epsilon } => {
-                let Affine { scale, shift } = scale_and_shift(gamma, beta, mean, variance, *epsilon);
+                let ChannelAffine { scale, shift } = scale_and_shift(gamma, beta, mean, variance, *epsilon);
                 scale.iter().chain(&shift).all(|value| (*value as f32).is_finite())
             }
             Op::PRelu { slopes } => slopes.iter().all(|value| value.is_finite()),
@@ -171,14 +177,14 @@ pub(crate) fn check_finite(steps: &[Step]) -> Result<()> {
 }
 
 /// `x · scale + shift` in each channel.
-pub(crate) struct Affine {
+pub(crate) struct ChannelAffine {
     pub scale: Vec<f64>,
     pub shift: Vec<f64>,
 }
 
 /// Merges every batch normalisation that directly follows a convolution or dense layer into its weights; others stay.
-pub(crate) fn fold_batch_norm(chain: Vec<Step>) -> Vec<Step> {
-    let mut folded: Vec<Step> = Vec::with_capacity(chain.len());
+pub(crate) fn fold_batch_norm(chain: Vec<ChainStep>) -> Vec<ChainStep> {
+    let mut folded: Vec<ChainStep> = Vec::with_capacity(chain.len());
     for step in chain {
         let before = folded.last_mut().map(|step| &mut step.op);
         match (before, &step.op) {
@@ -186,7 +192,7 @@ pub(crate) fn fold_batch_norm(chain: Vec<Step>) -> Vec<Step> {
                 Some(Op::Conv { weight, bias, .. } | Op::Dense { weight, bias }),
                 Op::BatchNorm { gamma, beta, mean, variance, epsilon },
             ) => {
-                let Affine { scale, shift } = scale_and_shift(gamma, beta, mean, variance, *epsilon);
+                let ChannelAffine { scale, shift } = scale_and_shift(gamma, beta, mean, variance, *epsilon);
                 let row = weight.len() / bias.len();
                 for (row, scale) in weight.chunks_exact_mut(row).zip(&scale) {
                     row.iter_mut().for_each(|w| *w = (f64::from(*w) * scale) as f32);
@@ -260,7 +266,7 @@ mod tests {
         let batch_norm =
             Op::BatchNorm { gamma: vec![3.0], beta: vec![0.5], mean: vec![2.0], variance: vec![3.75], epsilon: 0.25 };
         let shape = Shape::vector(1);
-        let step = |op| Step { name: String::new(), input: shape, output: shape, op };
+        let step = |op| ChainStep { name: String::new(), input: shape, output: shape, op };
         let dense = Op::Dense { weight: vec![4.0], bias: vec![1.0] };
         // (4 x + 1 − 2) · 3 / 2 + 0.5
         let expected = Op::Dense { weight: vec![6.0], bias: vec![-1.0] };

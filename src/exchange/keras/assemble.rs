@@ -9,7 +9,7 @@ use super::architecture::KerasLayer;
 use super::file::Tensor;
 use super::limits::check_size;
 use super::messages::{Problem, shown};
-use super::translate::{AxisOrder, KernelLayout, Operation, Step};
+use super::translate::{AxisOrder, KerasStep, KernelLayout, Operation};
 use crate::engine::layers::Slopes;
 use crate::engine::network::{LayerSpec, Parameters};
 use crate::engine::tensor::{Initializer, Shape};
@@ -44,7 +44,7 @@ pub(super) struct Context {
 pub(super) fn assemble(
     context: &Context,
     layers: &[KerasLayer],
-    steps: &[Step],
+    steps: &[KerasStep],
     tensors: &[Vec<Tensor>],
 ) -> Result<Assembly, Problem> {
     let mut assembler = Assembler {
@@ -79,7 +79,7 @@ struct Assembler<'a> {
 }
 
 impl Assembler<'_> {
-    fn step(&mut self, step: &Step, tensors: &[Tensor]) -> Result<(), String> {
+    fn step(&mut self, step: &KerasStep, tensors: &[Tensor]) -> Result<(), String> {
         match &step.operation {
             Operation::Nothing | Operation::Input => {}
             Operation::Plain(spec) => {

@@ -4,13 +4,16 @@ use std::path::Path;
 
 use super::film::Video;
 use super::onlooker::Onlooker;
-use super::painter::{Captions, FilmFrame, Painter};
+use super::painter::{Captions, FilmFrame, FilmScales, Painter};
 use super::summary::VideoSummary;
 use crate::error::{Error, Result};
 use crate::picture::RgbImage;
 use crate::simulator::car::dynamics::MAX_STEER_DEG;
+use crate::simulator::car::expert::pursuit;
 use crate::simulator::trial::run::{DRIVE_HZ, Failure};
-use crate::simulator::{DriveFrame, DriveObserver, Driver, HEIGHT, Run, RunOptions, Track, WIDTH, run_observed};
+use crate::simulator::{
+    DriveFrame, DriveObserver, Driver, HEIGHT, Run, RunOptions, Simulation, Track, WIDTH, run_observed,
+};
 
 /// A video of a run that is yet to be driven.
 pub struct DriveVideo {
@@ -42,7 +45,12 @@ impl DriveVideo {
         fps: Option<f64>,
         onlooker: Option<Onlooker>,
     ) -> Result<DriveVideo> {
-        let video = Video::create(path, Painter::new(names, Some(track)), fps.unwrap_or(DRIVE_HZ as f64))?;
+        let saliency = onlooker.as_ref().is_some_and(Onlooker::colours);
+        let video = Video::create(
+            path,
+            Painter::new(names, scales(track), Some(track), saliency),
+            fps.unwrap_or(DRIVE_HZ as f64),
+        )?;
         let frame = FilmFrame { picture: RgbImage::filled(HEIGHT, WIDTH, [0; 3]), ..FilmFrame::default() };
         Ok(DriveVideo { video, frame, onlooker })
     }
@@ -94,6 +102,18 @@ impl DriveObserver for FilmObserver<'_> {
             true => Ok(()),
             false => Err(Error::Interrupted),
         }
+    }
+}
+
+/// Scales for a drive on `track` that is yet to come: those that the expert needs. Its car is a metre from the line at most.
+fn scales(track: &Track) -> FilmScales {
+    let angle_deg = |station: &crate::simulator::road::track::Station| {
+        let heading_deg = station.ty.atan2(station.tx).to_degrees();
+        pursuit(&Simulation::posed(track, [station.x, station.y], heading_deg, 10.0)) * MAX_STEER_DEG
+    };
+    FilmScales {
+        darkest_m: 1.0,
+        ..FilmScales::covering(track.stations.iter().step_by(5).map(angle_deg), [].into_iter())
     }
 }
 
