@@ -8,6 +8,7 @@ use super::change::{BONNET, Change, HORIZON};
 use super::findings::{Baseline, Finding, findings};
 use super::footage::{Footage, FootageBuffers};
 use crate::error::{Error, Result};
+use crate::observer::{Observer, Progress, Tally};
 use crate::picture::RgbImage;
 use crate::pilot::Pilot;
 use crate::recipe::Recipe;
@@ -65,16 +66,16 @@ pub struct Counterfactuals {
 ///
 /// # Errors
 ///
-/// As [`Footage::picture`]; [`Error::Input`] if there is no picture.
+/// As [`Footage::picture`]; [`Error::Input`] if there is no picture; the observer's own.
 pub fn examine(
     pilot: &Pilot,
     footage: &Footage,
-    progress: &(dyn Fn(f64) -> bool + Sync),
+    observer: &mut (dyn Observer<Progress> + Send),
 ) -> Result<(Counterfactuals, Vec<f32>)> {
     if footage.is_empty() {
         return Err(Error::Input("there is no picture to look at".into()));
     }
-    let done = std::sync::atomic::AtomicUsize::new(0);
+    let tally = Tally::new(footage.len(), observer);
     let fresh = || (pilot.clone(), FootageBuffers::default(), RgbImage::default(), RgbImage::default());
     let look = |(pilot, buffers, image, changed): &mut (Pilot, FootageBuffers, RgbImage, RgbImage), i: usize| {
         footage.picture(i, buffers, image)?;
@@ -84,8 +85,8 @@ pub fn examine(
             change.apply(image, changed);
             *answer = pilot.steer(changed.height, changed.width, &changed.pixels)?;
         }
-        let count = done.fetch_add(1, std::sync::atomic::Ordering::Relaxed) + 1;
-        if progress(count as f64 / footage.len() as f64) { Ok(answers) } else { Err(Error::Interrupted) }
+        tally.add(1)?;
+        Ok(answers)
     };
     let answers: Vec<[f32; Change::ALL.len() + 1]> =
         (0..footage.len()).into_par_iter().map_init(fresh, look).collect::<Result<_>>()?;
@@ -208,46 +209,6 @@ fn verdict(change: Change, share: f64, right_way: Option<f64>, kept: [f64; 2]) -
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    fn picture() -> RgbImage {
-        RgbImage::from_fn(160, 320, |row, column| [row as u8, (column / 2) as u8, 90])
-    }
-
-    #[test]
-    fn changes_do_what_they_say() {
-        let (image, mut out) = (picture(), RgbImage::default());
-        let mut changed = |change: Change| {
-            change.apply(&image, &mut out);
-            out.clone()
-        };
-        let sky = changed(Change::MaskSky);
-        assert_eq!(
-            (sky.pixel(10, 5), sky.pixel(10, 300), sky.pixel(80, 5)),
-            ([10, 79, 90], [10, 79, 90], image.pixel(80, 5))
-        );
-        let road = changed(Change::MaskRoad);
-        assert_eq!(
-            (road.pixel(100, 160), road.pixel(60, 20), road.pixel(150, 160)),
-            ([100, 79, 90], image.pixel(60, 20), image.pixel(150, 160))
-        );
-        // The edges of a road 9 m wide, seen from its middle, belong to it: 10 m ahead they are 4.5 / 10 focal lengths aside.
-        let (focal, ten_metres_ahead) = (160.0 / 2.0 / 30f64.to_radians().tan(), HORIZON + 1.2 / 10.0 * 0.866);
-        for side in [-1.0, 1.0] {
-            let edge = 0.5 + side * 0.45 * focal / 320.0;
-            assert!(Change::MaskRoad.masks(ten_metres_ahead, edge), "{side}");
-        }
-        let beside = changed(Change::MaskBeside);
-        assert_eq!((beside.pixel(100, 160), beside.pixel(60, 20)), (image.pixel(100, 160), [60, 79, 90]));
-        assert_eq!(changed(Change::ShiftRight).pixel(7, 120), image.pixel(7, 100));
-        assert_eq!(changed(Change::ShiftLeft).pixel(7, 319), image.pixel(7, 319));
-        assert_eq!(changed(Change::Mirror).pixel(7, 0), image.pixel(7, 319));
-        assert_eq!(changed(Change::Darken).pixel(100, 0), [60, 0, 54]);
-        assert_eq!(changed(Change::Brighten).pixel(100, 0), [140, 0, 126]);
-        // Each pixel between horizon and bonnet belongs to the road or to what is beside it.
-        for (y, x) in [(0.4, 0.1), (0.5, 0.5), (0.8, 0.9), (0.45, 0.01)] {
-            assert!(Change::MaskRoad.masks(y, x) != Change::MaskBeside.masks(y, x), "{y} {x}");
-        }
-    }
 
     #[test]
     fn figures_are_those_of_a_case_computed_by_hand() {

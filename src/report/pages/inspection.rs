@@ -216,6 +216,11 @@ fn from_left_to_right(recording: &Recording, count: usize) -> Vec<usize> {
     (0..count).map(|i| rows[((rows.len() - 1) as f64 * place(i)).round() as usize]).collect()
 }
 
+/// A label with its sign, which zero has not.
+fn signed(label: f32) -> String {
+    if label == 0.0 { "0".into() } else { format!("{label:+.3}") }
+}
+
 fn camera_figure(image: &RgbImage, caption: String) -> Figure {
     Figure { source: image.jpeg_address(), caption, pixelated: false }
 }
@@ -238,7 +243,7 @@ fn samples(page: &mut Page, recording: &Recording, recipe: &Recipe, count: usize
         for &camera in &cameras {
             let Some(image) = recording.picture(row, camera) else { continue };
             let label = if recipe.samples.side_cameras.is_some() || camera == Camera::Centre {
-                format!("{:+.3}", recipe.samples.label(steering, camera))
+                signed(recipe.samples.label(steering, camera))
             } else {
                 "unused".into()
             };
@@ -248,7 +253,7 @@ fn samples(page: &mut Page, recording: &Recording, recipe: &Recipe, count: usize
             {
                 figures.push(camera_figure(
                     &centre.mirrored(),
-                    format!("line {line}, centre mirrored: label {:+.3}", -steering),
+                    format!("line {line}, centre mirrored: label {}", signed(-steering)),
                 ));
             }
         }
@@ -273,7 +278,7 @@ fn colours(page: &mut Page, recording: &Recording, spec: &Preprocessing, count: 
         spec.colour.name()
     ));
     for (row, image) in images {
-        page.subsection(&format!("Line {}, label {:+.3}", recording.rows[row].line, recording.rows[row].steering));
+        page.subsection(&format!("Line {}, label {}", recording.rows[row].line, signed(recording.rows[row].steering)));
         let mut figures =
             vec![camera_figure(&kept_rows(&image, spec), "the camera's picture; what is kept is not darkened".into())];
         for colour in Colour::ALL {
@@ -363,7 +368,7 @@ fn worst(page: &mut Page, inspection: &Inspection, count: usize) {
         .filter_map(|(row, why)| {
             let image = recording.picture(row, Camera::Centre)?;
             let (line, steering) = (recording.rows[row].line, recording.rows[row].steering);
-            Some(camera_figure(&image, format!("line {line}, label {steering:+.3}\n{why}")))
+            Some(camera_figure(&image, format!("line {line}, label {}\n{why}", signed(steering))))
         })
         .collect();
     page.figures(3, &figures);
