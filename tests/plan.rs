@@ -150,7 +150,7 @@ fn a_network_can_learn_eight_images_by_heart() {
             .recipe
             .layers
             .iter()
-            .filter(|layer| !matches!(layer, steersman::engine::network::LayerSpec::Dropout { .. }))
+            .filter(|layer| !matches!(layer, steersman::engine::network::LayerSpec::Dropout(_)))
             .cloned()
             .collect();
         let network = Network::new(setup.network.input(), &layers, Isa::best()).unwrap();
