@@ -12,9 +12,9 @@ use super::{or_dash, pool, print_json};
 use crate::dataset::held_out::trained_on_held_out;
 use crate::dataset::{self, Camera, Recording};
 use crate::error::{Error, Result};
+use crate::metrics::{Metrics, Prediction};
 use crate::model_file::Model;
 use crate::pilot::Pilot;
-use crate::report::{Metrics, Prediction};
 
 /// Compare a model's steering with what was recorded: centre camera, every usable row
 #[derive(Debug, Args)]

@@ -10,7 +10,6 @@ use std::path::Path;
 use rayon::prelude::*;
 
 use crate::dataset::colour::Colour;
-use crate::dataset::decode::{RgbImage, decode_rgb};
 use crate::dataset::preprocess::Preprocessing;
 use crate::dataset::resize::Interpolation;
 use crate::dataset::{Camera, Recording};
@@ -18,7 +17,8 @@ use crate::engine::layers::Family;
 use crate::engine::network::{InferencePlan, Network, Parameters};
 use crate::engine::tensor::Shape;
 use crate::error::{Error, Result};
-use crate::report::correlation;
+use crate::metrics::correlation;
+use crate::picture::{RgbImage, decode::decode_rgb};
 
 /// Kept rows of Udacity's picture, in projects of the field.
 const CROPS: [[usize; 2]; 12] = [

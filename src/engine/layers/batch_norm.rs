@@ -1,8 +1,8 @@
 //! Batch normalisation.
 
 use serde::{Deserialize, Serialize};
-use steersman_kernels::Isa;
 use steersman_kernels::norm;
+use steersman_kernels::{Backend, Isa};
 
 use super::{BatchStatistics, ExportForm, Family, Grads, Layer, LayerKind, Pair, ParamSpec, Pass, ReceptiveField};
 use crate::engine::tensor::Shape;
@@ -263,8 +263,8 @@ impl LayerKind for BatchNormSpec {
         Ok(())
     }
 
-    fn layer(&self, input: Shape, isa: Isa) -> Result<Box<dyn Layer>, String> {
-        Ok(Box::new(BatchNorm::new(input, self.epsilon, self.running_old_weight, isa)?))
+    fn layer(&self, input: Shape, backend: Backend) -> Result<Box<dyn Layer>, String> {
+        Ok(Box::new(BatchNorm::new(input, self.epsilon, self.running_old_weight, backend.isa)?))
     }
 
     fn export_form(&self, _input: Shape, params: &[f32], statistics: &[f32]) -> ExportForm {

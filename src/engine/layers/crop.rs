@@ -1,7 +1,7 @@
 //! Cutting the border off inside the network.
 
 use serde::{Deserialize, Serialize};
-use steersman_kernels::Isa;
+use steersman_kernels::Backend;
 
 use super::kind::check_sizes;
 use super::{ExportForm, Family, Grads, Layer, LayerKind, Pair, Pass, ReceptiveField};
@@ -112,7 +112,7 @@ impl LayerKind for CropSpec {
         check_sizes(&sizes.into_iter().map(|size| ("rows and columns", size)).collect::<Vec<_>>())
     }
 
-    fn layer(&self, input: Shape, _isa: Isa) -> Result<Box<dyn Layer>, String> {
+    fn layer(&self, input: Shape, _backend: Backend) -> Result<Box<dyn Layer>, String> {
         Ok(Box::new(Crop::new(input, self.rows, self.columns)?))
     }
 

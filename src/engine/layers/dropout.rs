@@ -2,7 +2,7 @@
 
 use rand::Rng;
 use serde::{Deserialize, Serialize};
-use steersman_kernels::Isa;
+use steersman_kernels::Backend;
 
 use super::{ExportForm, Family, Grads, Layer, LayerKind, Pair, Pass, ReceptiveField};
 use crate::engine::random::{Purpose, rng};
@@ -105,7 +105,7 @@ impl LayerKind for DropoutSpec {
         Ok(())
     }
 
-    fn layer(&self, input: Shape, _isa: Isa) -> Result<Box<dyn Layer>, String> {
+    fn layer(&self, input: Shape, _backend: Backend) -> Result<Box<dyn Layer>, String> {
         Ok(Box::new(Dropout::new(input, self.drop_probability)?))
     }
 

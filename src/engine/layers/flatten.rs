@@ -1,7 +1,7 @@
 //! From a map to a vector.
 
 use serde::{Deserialize, Serialize};
-use steersman_kernels::Isa;
+use steersman_kernels::Backend;
 
 use super::{ExportForm, Family, Grads, Layer, LayerKind, Pair, Pass, ReceptiveField};
 use crate::engine::tensor::Shape;
@@ -81,7 +81,7 @@ impl LayerKind for FlattenSpec {
         Ok(())
     }
 
-    fn layer(&self, input: Shape, _isa: Isa) -> Result<Box<dyn Layer>, String> {
+    fn layer(&self, input: Shape, _backend: Backend) -> Result<Box<dyn Layer>, String> {
         Ok(Box::new(Flatten::new(input)))
     }
 

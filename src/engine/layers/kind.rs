@@ -2,7 +2,7 @@
 
 use std::fmt::Debug;
 
-use steersman_kernels::Isa;
+use steersman_kernels::Backend;
 
 use super::{ExportForm, Layer};
 use crate::engine::tensor::Shape;
@@ -46,20 +46,22 @@ pub trait LayerKind: Debug {
     /// # Errors
     ///
     /// A sentence that says what does not fit.
-    fn layer(&self, input: Shape, isa: Isa) -> Result<Box<dyn Layer>, String>;
+    fn layer(&self, input: Shape, backend: Backend) -> Result<Box<dyn Layer>, String>;
 
     /// What the layer computes in evaluation, in the elementary operations that every exporter knows. `params` and
     /// `statistics` are laid out as [`Layer::params`] and [`Layer::statistics`] say.
     fn export_form(&self, input: Shape, params: &[f32], statistics: &[f32]) -> ExportForm;
+}
 
-    /// The checked layer for inputs of shape `input`, with the vector code of `isa`.
+impl dyn LayerKind + '_ {
+    /// The checked layer for inputs of shape `input`. `backend` is an instruction set, or one with an algorithm of convolution.
     ///
     /// # Errors
     ///
     /// A sentence that says which option is out of range or what does not fit.
-    fn build(&self, input: Shape, isa: Isa) -> Result<Box<dyn Layer>, String> {
+    pub fn build(&self, input: Shape, backend: impl Into<Backend>) -> Result<Box<dyn Layer>, String> {
         self.check(input)?;
-        self.layer(input, isa)
+        self.layer(input, backend.into())
     }
 }
 

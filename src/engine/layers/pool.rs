@@ -1,8 +1,8 @@
 //! Pooling.
 
 use serde::{Deserialize, Serialize};
-use steersman_kernels::Isa;
 use steersman_kernels::pool::{self, PoolShape};
+use steersman_kernels::{Backend, Isa};
 
 use super::kind::{check_sizes, pair};
 use super::{ExportForm, Family, Grads, Layer, LayerKind, Pair, Pass, ReceptiveField};
@@ -147,8 +147,8 @@ impl LayerKind for MaxPoolSpec {
         check(self.window, self.stride)
     }
 
-    fn layer(&self, input: Shape, isa: Isa) -> Result<Box<dyn Layer>, String> {
-        Ok(Box::new(MaxPool::new(input, self.window, self.stride.unwrap_or(self.window), isa)?))
+    fn layer(&self, input: Shape, backend: Backend) -> Result<Box<dyn Layer>, String> {
+        Ok(Box::new(MaxPool::new(input, self.window, self.stride.unwrap_or(self.window), backend.isa)?))
     }
 
     fn export_form(&self, _input: Shape, _params: &[f32], _statistics: &[f32]) -> ExportForm {
@@ -188,8 +188,8 @@ impl LayerKind for AveragePoolSpec {
         check(self.window, self.stride)
     }
 
-    fn layer(&self, input: Shape, isa: Isa) -> Result<Box<dyn Layer>, String> {
-        Ok(Box::new(AveragePool::new(input, self.window, self.stride.unwrap_or(self.window), isa)?))
+    fn layer(&self, input: Shape, backend: Backend) -> Result<Box<dyn Layer>, String> {
+        Ok(Box::new(AveragePool::new(input, self.window, self.stride.unwrap_or(self.window), backend.isa)?))
     }
 
     fn export_form(&self, _input: Shape, _params: &[f32], _statistics: &[f32]) -> ExportForm {

@@ -1,7 +1,7 @@
 //! Fixed scaling inside the network.
 
 use serde::{Deserialize, Serialize};
-use steersman_kernels::Isa;
+use steersman_kernels::Backend;
 
 use super::{ExportForm, Family, Formula, Grads, Layer, LayerKind, Pair, Pass, ReceptiveField};
 use crate::engine::tensor::Shape;
@@ -93,7 +93,7 @@ impl LayerKind for ScaleSpec {
         Ok(())
     }
 
-    fn layer(&self, input: Shape, _isa: Isa) -> Result<Box<dyn Layer>, String> {
+    fn layer(&self, input: Shape, _backend: Backend) -> Result<Box<dyn Layer>, String> {
         Ok(Box::new(Scale::new(input, self.factor, self.offset)?))
     }
 

@@ -1,7 +1,7 @@
 //! Zeros around the border.
 
 use serde::{Deserialize, Serialize};
-use steersman_kernels::Isa;
+use steersman_kernels::Backend;
 
 use super::kind::MAX_NUMBERS;
 use super::{ExportForm, Family, Grads, Layer, LayerKind, Pair, Pass, ReceptiveField};
@@ -111,7 +111,7 @@ impl LayerKind for ZeroPadSpec {
         }
     }
 
-    fn layer(&self, input: Shape, _isa: Isa) -> Result<Box<dyn Layer>, String> {
+    fn layer(&self, input: Shape, _backend: Backend) -> Result<Box<dyn Layer>, String> {
         Ok(Box::new(ZeroPad::new(input, self.rows, self.columns)))
     }
 

@@ -4,7 +4,7 @@ use serde_json::{Map, Value};
 
 use super::architecture::KerasLayer;
 use super::lambda::{self, Affine};
-use super::shown;
+use super::messages::shown;
 use crate::engine::layers::{
     BatchNormSpec, Conv2dSpec, CropSpec, DropoutSpec, EluSpec, LeakyReluSpec, Padding, ReluSpec, ScaleSpec,
     SoftsignSpec, SwishSpec, TanhSpec, ZeroPadSpec,

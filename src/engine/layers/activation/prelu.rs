@@ -1,8 +1,8 @@
 //! Leaky rectified linear unit with trainable slopes.
 
 use serde::{Deserialize, Serialize};
-use steersman_kernels::Isa;
 use steersman_kernels::activation;
+use steersman_kernels::{Backend, Isa};
 
 use crate::engine::layers::kind::check_first_value;
 use crate::engine::layers::{ExportForm, Family, Grads, Layer, LayerKind, Pair, ParamSpec, Pass, ReceptiveField};
@@ -131,8 +131,8 @@ impl LayerKind for PReluSpec {
         check_first_value(self.initial_slope)
     }
 
-    fn layer(&self, input: Shape, isa: Isa) -> Result<Box<dyn Layer>, String> {
-        Ok(Box::new(PRelu::new(input, self.slopes, self.initial_slope, isa)))
+    fn layer(&self, input: Shape, backend: Backend) -> Result<Box<dyn Layer>, String> {
+        Ok(Box::new(PRelu::new(input, self.slopes, self.initial_slope, backend.isa)))
     }
 
     fn export_form(&self, _input: Shape, params: &[f32], _statistics: &[f32]) -> ExportForm {

@@ -1,8 +1,8 @@
 //! Swish (SiLU).
 
 use serde::{Deserialize, Serialize};
-use steersman_kernels::Isa;
 use steersman_kernels::activation;
+use steersman_kernels::{Backend, Isa};
 
 use crate::engine::layers::{
     ExportForm, Family, Formula, Function, Grads, Layer, LayerKind, Pair, Pass, ReceptiveField,
@@ -82,8 +82,8 @@ impl LayerKind for SwishSpec {
         Ok(())
     }
 
-    fn layer(&self, input: Shape, isa: Isa) -> Result<Box<dyn Layer>, String> {
-        Ok(Box::new(Swish::new(input, isa)))
+    fn layer(&self, input: Shape, backend: Backend) -> Result<Box<dyn Layer>, String> {
+        Ok(Box::new(Swish::new(input, backend.isa)))
     }
 
     fn export_form(&self, _input: Shape, _params: &[f32], _statistics: &[f32]) -> ExportForm {
