@@ -167,7 +167,9 @@ pub mod recipe;
 pub mod report;
 pub mod serve;
 pub mod simulator;
+pub mod simulator_client;
 mod text;
 pub mod training;
+pub mod udacity;
 
 pub use error::{Error, Result};
