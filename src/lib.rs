@@ -168,6 +168,7 @@ pub mod report;
 pub mod serve;
 pub mod simulator;
 pub mod simulator_client;
+mod statistics;
 mod text;
 pub mod training;
 pub mod udacity;
