@@ -12,8 +12,9 @@ use rayon::prelude::*;
 use crate::dataset::colour::Colour;
 use crate::dataset::preprocess::Preprocessing;
 use crate::dataset::resize::Interpolation;
-use crate::dataset::{Camera, Recording};
-use crate::engine::network::{InferencePlan, LayerSpec, Network, Parameters};
+use crate::dataset::{Recording, View};
+use crate::engine::layers::Family;
+use crate::engine::network::{InferencePlan, Network, Parameters};
 use crate::engine::tensor::Shape;
 use crate::error::{Error, Result};
 use crate::metrics::correlation;
@@ -76,14 +77,14 @@ impl Frames {
     ///
     /// [`Error::Data`] if no frame can be read or all labels are the same.
     pub fn of(recording: &Recording) -> Result<Frames> {
-        let rows = || (0..recording.rows.len()).filter(|row| recording.row_has(*row, Camera::Centre));
+        let rows = || (0..recording.rows.len()).filter(|row| recording.row_has(*row, View::Centre));
         let is_turned = |row: &usize| recording.rows[*row].steering.abs() >= TURNED;
         let turned = spread(rows().filter(is_turned).collect(), FRAMES[1] * 2 / 3);
         let straight = spread(rows().filter(|row| !is_turned(row)).collect(), FRAMES[1] - FRAMES[1] * 2 / 3);
         let mut chosen = [turned, straight].concat();
         chosen.sort_unstable();
         let read = |row: usize| -> Option<(RgbImage, f32)> {
-            let bytes = std::fs::read(recording.image_path(row, Camera::Centre)?).ok()?;
+            let bytes = std::fs::read(recording.image_path(row, View::Centre)?).ok()?;
             let mut image = RgbImage::default();
             decode_rgb(&bytes, &mut image).ok()?;
             // All combinations begin by scaling the image to this size; so much of it is kept in memory.
@@ -129,8 +130,8 @@ pub fn combinations(network: &Network) -> Vec<Preprocessing> {
         _ => &[],
     };
     // A network that scales by itself wants grey levels.
-    let first = network.layers().iter().find(|layer| !matches!(layer.spec, LayerSpec::Crop { .. }));
-    let scales_itself = first.is_some_and(|l| matches!(l.spec, LayerSpec::Scale { .. } | LayerSpec::BatchNorm { .. }));
+    let first = network.layers().iter().find(|layer| layer.spec.family() != Family::Rearrangement);
+    let scales_itself = first.is_some_and(|layer| layer.spec.family() == Family::Normalization);
     let scalings = if scales_itself { &SCALINGS[..1] } else { &SCALINGS[..] };
     let mut all = Vec::new();
     for colour in colours {
@@ -240,8 +241,8 @@ mod tests {
     #[test]
     fn the_colour_space_that_the_labels_follow_wins() {
         let layers = [
-            LayerSpec::Scale { factor: 1.0 / 255.0, offset: 0.0 },
-            LayerSpec::Dense { units: 1, init: Default::default() },
+            crate::engine::layers::ScaleSpec { factor: 1.0 / 255.0, offset: 0.0 }.into(),
+            crate::engine::layers::DenseSpec { units: 1, init: Default::default() }.into(),
         ];
         let network = Network::new(Shape::new(3, 4, 8), &layers, Isa::PORTABLE).unwrap();
         let mut parameters = network.initialize(1);

@@ -3,7 +3,8 @@
 use super::chart::NARROW;
 use super::palette::{BLUE, GREEN, INK, ORANGE, PALE, QUIET_INK};
 use super::svg::{Anchor, Svg, wrapped};
-use crate::engine::network::{LayerSpec, Network, group_digits};
+use crate::engine::layers::Family;
+use crate::engine::network::{Network, group_digits};
 use crate::engine::tensor::Shape;
 
 /// Width of the drawing, pixels.
@@ -31,20 +32,12 @@ fn groups(network: &Network) -> Vec<LayerGroup> {
     let mut groups =
         vec![LayerGroup { name: "input".into(), colour: PALE, shape: input, lines: Vec::new(), params: 0 }];
     for layer in network.layers() {
-        let colour = match layer.spec {
-            LayerSpec::Conv2d { .. } => Some(BLUE),
-            LayerSpec::MaxPool { .. } | LayerSpec::AveragePool { .. } => Some(GREEN),
-            LayerSpec::Dense { .. } => Some(ORANGE),
-            LayerSpec::Flatten {} | LayerSpec::Crop { .. } | LayerSpec::ZeroPad { .. } => Some(PALE),
-            LayerSpec::BatchNorm { .. }
-            | LayerSpec::Relu {}
-            | LayerSpec::Elu { .. }
-            | LayerSpec::PRelu { .. }
-            | LayerSpec::LeakyRelu { .. }
-            | LayerSpec::Tanh {}
-            | LayerSpec::Softsign {}
-            | LayerSpec::Dropout { .. }
-            | LayerSpec::Scale { .. } => None,
+        let colour = match layer.spec.family() {
+            Family::Convolution => Some(BLUE),
+            Family::Pooling => Some(GREEN),
+            Family::Dense => Some(ORANGE),
+            Family::Rearrangement => Some(PALE),
+            Family::Activation | Family::Normalization | Family::Regularization => None,
         };
         let (what, params) = (layer.spec.describe(), layer.params.len() + layer.statistics.len());
         match (colour, groups.last_mut()) {

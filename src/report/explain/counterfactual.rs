@@ -143,7 +143,7 @@ pub(super) fn judge(
             Effect {
                 change,
                 mean_moved_deg,
-                p95_moved_deg: crate::simulator::trial::statistics::quantile(&distances, 0.95),
+                p95_moved_deg: crate::statistics::quantile(&distances, 0.95),
                 bias_deg: mean(&moved),
                 right_way_share,
                 mae_deg: mae_after_deg,

@@ -3,7 +3,7 @@
 use crate::dataset::colour::Colour;
 use crate::dataset::inspect::{Inspection, Suspicion, contradiction, seen_steering};
 use crate::dataset::preprocess::Preprocessing;
-use crate::dataset::{Camera, Recording};
+use crate::dataset::{Recording, View};
 use crate::picture::RgbImage;
 use crate::recipe::Recipe;
 use crate::report::charts::chart::{Axis, Chart, Mark};
@@ -227,8 +227,8 @@ fn camera_figure(image: &RgbImage, caption: String) -> Figure {
 
 fn samples(page: &mut Page, recording: &Recording, recipe: &Recipe, count: usize) {
     page.section("What the cameras see");
-    let cameras: Vec<Camera> =
-        [Camera::Left, Camera::Centre, Camera::Right].into_iter().filter(|&camera| recording.has(camera)).collect();
+    let cameras: Vec<View> =
+        [View::Left, View::Centre, View::Right].into_iter().filter(|&camera| recording.has(camera)).collect();
     let used = match recipe.samples.side_cameras {
         _ if cameras.len() < 2 => String::new(),
         Some(by) => {
@@ -242,14 +242,14 @@ fn samples(page: &mut Page, recording: &Recording, recipe: &Recipe, count: usize
         let (line, steering) = (recording.rows[row].line, recording.rows[row].steering);
         for &camera in &cameras {
             let Some(image) = recording.picture(row, camera) else { continue };
-            let label = if recipe.samples.side_cameras.is_some() || camera == Camera::Centre {
+            let label = if recipe.samples.side_cameras.is_some() || camera == View::Centre {
                 signed(recipe.samples.label(steering, camera))
             } else {
                 "unused".into()
             };
             figures.push(camera_figure(&image, format!("line {line}, {}: label {label}", camera.name())));
-            if camera == *cameras.last().unwrap_or(&Camera::Centre)
-                && let Some(centre) = recording.picture(row, Camera::Centre)
+            if camera == *cameras.last().unwrap_or(&View::Centre)
+                && let Some(centre) = recording.picture(row, View::Centre)
             {
                 figures.push(camera_figure(
                     &centre.mirrored(),
@@ -266,7 +266,7 @@ fn colours(page: &mut Page, recording: &Recording, spec: &Preprocessing, count: 
     let mut rows = from_left_to_right(recording, count.max(2));
     rows.truncate(count);
     let images: Vec<(usize, RgbImage)> =
-        rows.into_iter().filter_map(|row| Some((row, recording.picture(row, Camera::Centre)?))).collect();
+        rows.into_iter().filter_map(|row| Some((row, recording.picture(row, View::Centre)?))).collect();
     let Some((_, image)) = images.first() else { return };
     page.section("What the network sees");
     let ([first, end], [height, width]) = (kept(image, spec), spec.resize);
@@ -366,7 +366,7 @@ fn worst(page: &mut Page, inspection: &Inspection, count: usize) {
     let figures: Vec<Figure> = chosen
         .into_iter()
         .filter_map(|(row, why)| {
-            let image = recording.picture(row, Camera::Centre)?;
+            let image = recording.picture(row, View::Centre)?;
             let (line, steering) = (recording.rows[row].line, recording.rows[row].steering);
             Some(camera_figure(&image, format!("line {line}, label {}\n{why}", signed(steering))))
         })

@@ -8,7 +8,7 @@ use super::drives;
 use super::html::{Figure, Page};
 use super::split_view::SplitView;
 use crate::dataset::held_out::trained_on_held_out;
-use crate::dataset::{Camera, Item};
+use crate::dataset::{Item, View};
 use crate::engine::network::{Network, group_digits};
 use crate::error::Result;
 use crate::files::atomic_file;
@@ -172,7 +172,7 @@ fn learning_curves(history: &[EpochRecord]) -> Vec<String> {
 /// What the model says of the centre images of the validation side, in their order; those that cannot be decoded left out.
 fn answers(pilot: &Pilot, data: &Data) -> Vec<Answer> {
     let centre: Vec<Item> =
-        data.split().validation.iter().copied().filter(|item| item.cameras().any(|c| c == Camera::Centre)).collect();
+        data.split().validation.iter().copied().filter(|item| item.cameras().any(|c| c == View::Centre)).collect();
     // Sessions are counted through all recordings.
     let mut sessions_before = vec![0];
     for recording in data.recordings() {
@@ -181,7 +181,7 @@ fn answers(pilot: &Pilot, data: &Data) -> Vec<Answer> {
     let answer = |pilot: &mut Pilot, item: Item| {
         let (index, row) = (usize::from(item.recording), item.row as usize);
         let recording = &data.recordings()[index];
-        let steering = pilot.steer_file(&recording.image_path(row, Camera::Centre)?).ok()?;
+        let steering = pilot.steer_file(&recording.image_path(row, View::Centre)?).ok()?;
         let prediction = Prediction {
             steering,
             label: recording.rows[row].steering,
@@ -311,7 +311,7 @@ fn worst(page: &mut Page, answers: &[Answer], data: &Data, full_lock_deg: f64) {
         .filter_map(|Answer { item, prediction }| {
             let recording = &data.recordings()[usize::from(item.recording)];
             let row = item.row as usize;
-            let mut image = recording.picture(row, Camera::Centre)?;
+            let mut image = recording.picture(row, View::Centre)?;
             let [recorded_deg, model_deg] =
                 [prediction.label, prediction.steering].map(|s| f64::from(s) * full_lock_deg);
             draw_steering(&mut image, recorded_deg, REFERENCE_RGB);
