@@ -1,4 +1,4 @@
-//! DAgger (Ross, Gordon and Bagnell 2011): the model drives, the expert says at every moment what it would have done.
+//! DAgger (Ross, Gordon and Bagnell 2011): the model drives, and the expert labels every frame with its own steering.
 
 use std::path::{Path, PathBuf};
 

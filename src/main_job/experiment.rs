@@ -18,7 +18,7 @@ use crate::recipe::Recipe;
 use crate::simulator::DriveOptions;
 use crate::training::{self, TrainRequest};
 
-/// What is varied.
+/// The setting that an experiment varies.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Subject {
     /// How validation rows are chosen: by blocks of time, single rows, single images.
@@ -58,7 +58,7 @@ impl Subject {
 /// An experiment.
 #[derive(Clone, Debug)]
 pub struct Plan {
-    /// What is varied.
+    /// The setting that is varied.
     pub subject: Subject,
     /// What stays the same.
     pub recipe: Recipe,

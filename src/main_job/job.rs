@@ -97,9 +97,9 @@ fn observed<T>(
 pub struct Scope {
     /// Folder of the training sets.
     pub recordings: PathBuf,
-    /// What is recorded and trained on.
+    /// Takes to record and train on.
     pub takes: Vec<Take>,
-    /// What is driven.
+    /// Tracks to drive.
     pub tracks: Vec<String>,
 }
 

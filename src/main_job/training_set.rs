@@ -105,11 +105,11 @@ fn digits(hash: Sha256) -> String {
     hash.finalize().iter().take(8).map(|byte| format!("{byte:02x}")).collect()
 }
 
-/// The recordings of `takes` under `folder`, in order; recorded first if they are not there yet. The flag tells whether
-/// they were.
+/// The recordings of `takes` under `folder`, in order; records them first if they do not exist. The flag is `true` if they
+/// existed.
 ///
 /// A set lies in a folder named after a hash of its settings. It is written under another name and renamed when it is
-/// complete, so a set that is there is whole. `observer` is told the share that is recorded.
+/// complete, so a set that exists is complete. `observer` is told the share that is recorded.
 ///
 /// # Errors
 ///
@@ -198,6 +198,30 @@ mod tests {
             "the simulator draws or drives otherwise than before; if that is wanted, SIMULATOR becomes {now:?}, and training \
              sets are recorded anew"
         );
+    }
+
+    #[test]
+    fn held_out_tracks_look_like_no_training_track() {
+        use crate::simulator::road::spec::{Centre, Edge, Plant, Surface, Wall};
+        let reserved = |track: &Track| {
+            let looks = &track.spec.look;
+            let surface = looks.iter().any(|l| matches!(l.surface, Surface::Concrete | Surface::Gravel));
+            let edge =
+                looks.iter().any(|l| [l.left, l.right].iter().any(|e| matches!(e, Edge::Dashes | Edge::Overgrown)));
+            let centre = looks.iter().any(|l| l.centre == Centre::Yellow);
+            let plants = &track.spec.land.plants;
+            let plant = plants.iter().any(|p| matches!(p, Plant::Cypress | Plant::Fir | Plant::Birch));
+            let walls = track.spec.stretch.iter().flat_map(|s| [s.left_wall, s.right_wall]);
+            let wall = walls.flatten().any(|w| matches!(w, Wall::Stone | Wall::Fence));
+            [surface, edge, plant, wall, centre]
+        };
+        for name in ["coast", "forest"] {
+            assert_eq!(reserved(&Track::load(name).unwrap())[..4], [true; 4], "{name}");
+        }
+        assert!(reserved(&Track::load("coast").unwrap())[4]);
+        for take in takes() {
+            assert_eq!(reserved(&Track::load(&take.track).unwrap()), [false; 5], "{}", take.track);
+        }
     }
 
     fn few() -> Vec<Take> {

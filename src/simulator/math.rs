@@ -165,7 +165,7 @@ pub fn value_noise(x: f32, y: f32, period: Option<(i32, i32)>, seed: u32) -> f32
     lerp(lerp(at(i, j), at(i + 1, j), fx), lerp(at(i, j + 1), at(i + 1, j + 1), fx), fy)
 }
 
-/// A small random generator (SplitMix64): what is drawn depends on the seed alone.
+/// A small random generator (SplitMix64), determined by its seed alone.
 #[derive(Clone, Debug)]
 pub struct Rng(u64);
 

@@ -4,9 +4,9 @@
 //! World coordinates are metres: x east, y north, z up. Angles of direction run anticlockwise from east. `steering` is
 //! normalised to [-1, 1], + = right; offsets from the reference line are + = right.
 //!
-//! Each room uses only those before it: `math`, `road` (the line, the track file, random tracks), `scenery` (what there is to
-//! see), `track` (a road with its scenery), `car` (its motion, and who moves the wheel), `camera` (its pictures), `trial` (a
-//! measured drive), `recorder` (a drive as a recording).
+//! Each room uses only those before it: `math`, `road` (the line, the track file, random tracks), `scenery` (the visible
+//! world), `track` (a road with its world), `car` (its motion, the expert), `camera` (its frames), `trial` (a measured drive),
+//! `recorder` (a drive as a recording).
 
 pub(crate) mod camera;
 pub(crate) mod car;

@@ -1,4 +1,4 @@
-//! A track: a road, and what there is to see along it.
+//! A track: a road and its visible world.
 
 use std::ops::Deref;
 use std::path::Path;
@@ -95,7 +95,7 @@ impl Track {
         &self.spec.name
     }
 
-    /// What there is to see; built on first use.
+    /// The visible world; built on first use.
     pub fn world(&self) -> &World {
         self.world.get_or_init(|| World::build(&self.road))
     }

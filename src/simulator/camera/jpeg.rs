@@ -32,7 +32,7 @@ pub fn decode(bytes: &[u8], frame: &mut RgbFrame) -> Result<()> {
     JpegDecoder::new(ZCursor::new(bytes)).decode_into(&mut frame.pixels).map_err(|e| fail(&e))
 }
 
-/// Encodes and decodes a frame, as on its way to a driver. Keeps its buffer.
+/// Encodes a frame and decodes it again, as a driver receives it. Keeps its buffer.
 #[derive(Default)]
 pub struct RoundTrip {
     bytes: Vec<u8>,

@@ -22,7 +22,7 @@ const SMOOTH_LIGHT_M: f32 = 45.0;
 const RED_BLUE: u32 = 0x00ff_00ff;
 /// Full light.
 pub(super) const FULL: u32 = 256;
-/// What is needed to find and colour the ground of one picture.
+/// Everything that finds and shades the ground of one frame.
 pub(super) struct View<'a> {
     pub(super) world: &'a World,
     pub(super) variant: &'a Variant,

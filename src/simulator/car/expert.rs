@@ -49,7 +49,7 @@ pub enum Style {
 
 /// Turns wanted steering into that of a driver with two keys.
 ///
-/// The wheel moves as [`keys::wheel`] tells. The driver presses a key when the integral of
+/// The wheel moves by [`keys::wheel`]. The driver presses a key when the integral of
 /// the missing steering is large enough, and releases it when the integral is nearly zero.
 #[derive(Clone, Debug, Default)]
 pub struct Keyboard {

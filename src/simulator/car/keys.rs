@@ -17,7 +17,7 @@ pub fn wheel(wheel: f64, pressed: f64) -> f64 {
 }
 
 /// The pedals, [-1, 1] from the brake to the accelerator, one step later. `pressed` is -1 for the brake's key, +1 for the
-/// accelerator's. Whoever changes from one to the other has lifted the foot (Unity: the axis snaps).
+/// accelerator's. A change from one to the other starts at 0 (Unity: the axis snaps).
 pub fn pedals(pedals: f64, pressed: f64) -> f64 {
     let from = if pedals * pressed < 0.0 { 0.0 } else { pedals };
     let step = RETURN_PER_S * STEP_S;

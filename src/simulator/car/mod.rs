@@ -1,4 +1,4 @@
-//! The car, and who moves its pedals and its wheel.
+//! The car: its motion, the expert, keys, and the speed controller.
 
 pub mod dynamics;
 pub mod expert;

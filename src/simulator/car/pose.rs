@@ -1,4 +1,4 @@
-//! Where the body of the car is, for whoever looks out of it.
+//! The pose of the car's body, on which the cameras are mounted.
 
 use crate::simulator::math::Vec3;
 

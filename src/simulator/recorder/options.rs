@@ -1,4 +1,4 @@
-//! What to record, and what is noted of a recording beside its log.
+//! The options of a recording, and its description in `recording.toml`.
 
 use std::fs;
 use std::path::Path;
@@ -10,7 +10,7 @@ use crate::simulator::car::expert::Style;
 use crate::simulator::track::Track;
 use crate::{Error, Result};
 
-/// Rows of the log for each second, unless told otherwise.
+/// Default rows of the log per second.
 pub const RECORD_HZ: u64 = 10;
 
 /// How the log is written.
@@ -78,7 +78,7 @@ impl Default for RecordOptions {
     }
 }
 
-/// What `recording.toml` says of a recording.
+/// The description of a recording, saved as `recording.toml`.
 #[derive(Clone, Debug, Serialize)]
 pub struct RecordingInfo {
     /// Track as given on the command line.

@@ -52,7 +52,7 @@ pub struct Location {
 
 /// A road that has passed its checks: all that is known of a track before anything is drawn.
 pub struct Road {
-    /// What the track file says.
+    /// The track file.
     pub spec: TrackSpec,
     /// The reference line.
     pub stations: Vec<Station>,

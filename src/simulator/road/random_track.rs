@@ -103,7 +103,7 @@ fn soil(rng: &mut Rng) -> Rgb {
     [red, green, low].map(|c| c as u8)
 }
 
-/// Widest shoulder, m: what is left of the texture beyond an edge.
+/// Maximum width of a shoulder, m: the rest of the texture beyond an edge.
 const SHOULDER_M: f64 = 3.5;
 
 fn look(rng: &mut Rng, name: &str) -> Look {

@@ -1,4 +1,4 @@
-//! What a track file says: the line, the road's looks, the roadside and the light, as strict TOML.
+//! The track file: the line, the looks of the road, the roadside and the light, as strict TOML.
 
 use serde::{Deserialize, Serialize};
 

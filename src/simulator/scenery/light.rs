@@ -20,7 +20,7 @@ pub struct Variant {
 
 impl Variant {
     /// The variant of the trial `seed`: brightness ±15 %, contrast ±12 %, colour ±5 % a channel, road ±12 %, depth of
-    /// shadows ±25 %. Seed 0 is the track as its file says.
+    /// shadows ±25 %. Seed 0 is the light of the track file.
     pub fn new(world: &World, seed: u64) -> Variant {
         let mut rng = Rng::new(seed, "light");
         let mut around = |spread: f64| if seed == 0 { 0.0 } else { rng.between(-spread, spread) as f32 };

@@ -300,7 +300,7 @@ pub struct GroundMap {
 pub const FULL_LIGHT: f32 = 128.0;
 
 impl GroundMap {
-    /// Colours the land. `shadow` tells the part of sunlight that trees let through at a texel (0 to 1).
+    /// Paints the map. `shadow` is the share of sunlight that trees let through at each texel, 0 to 255.
     pub fn build(road: &Road, terrain: &Terrain, lit: &[(f32, f32)], shadow: &[u8]) -> GroundMap {
         let land = &road.spec.land;
         let light = &road.spec.light;
@@ -398,7 +398,7 @@ impl GroundMap {
     }
 }
 
-/// Bits behind the point of fixed-point places on the map; the unit is the finest texel of 0.5 m.
+/// Fraction bits of fixed-point coordinates on the map; the unit is the finest texel of 0.5 m.
 pub const GROUND_FRACTION_BITS: u32 = 10;
 /// Fixed-point units for each metre.
 pub const GROUND_UNITS_PER_M: f32 = (2 << GROUND_FRACTION_BITS) as f32;

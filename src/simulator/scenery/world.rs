@@ -245,8 +245,8 @@ impl<'a> Scenery<'a> {
             let plant = land.plants[rng.below(land.plants.len())];
             let (variant, scale, mirrored) = (rng.below(VARIANTS), rng.between(0.7, 1.25), rng.unit() < 0.5);
             let (x, y) = (x as f32, y as f32);
-            let least = if k < near { land.plants_from_m } else { 20.0 };
-            if self.distance_from_edge(x, y).is_none_or(|e| e >= least) {
+            let min_m = if k < near { land.plants_from_m } else { 20.0 };
+            if self.distance_from_edge(x, y).is_none_or(|e| e >= min_m) {
                 let picture = self.pictures_of(plant) + variant;
                 self.stand(x, y, picture, scale as f32, mirrored);
             }

@@ -62,7 +62,7 @@ where
     Ok(put_together(track, options, measured, 1))
 }
 
-/// What is measured of one seed.
+/// The measurements of one seed.
 struct Measured {
     pair: TrialPair,
     expert: Trial,

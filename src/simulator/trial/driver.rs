@@ -1,4 +1,4 @@
-//! Who steers in a trial: anything that answers a picture.
+//! Drivers: anything that answers a frame with steering.
 
 use crate::simulator::camera::pinhole::RgbFrame;
 use crate::simulator::car::expert;

@@ -1,4 +1,4 @@
-//! The way of a run as a file, and read again.
+//! Trajectories: trials as CSV files.
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -56,7 +56,7 @@ pub struct Waypoint {
     pub speed_mph: f64,
     /// 1 if the car was just put back, else 0.
     pub intervention: u8,
-    /// Where the car points: deg, anticlockwise from east. Older files do not tell.
+    /// Where the car points: deg, anticlockwise from east. Absent in older files.
     pub heading_deg: Option<f64>,
 }
 
