@@ -9,8 +9,7 @@ use steersman::recipe::Recipe;
 use steersman::simulator::camera::jpeg;
 use steersman::simulator::trial::run::run;
 use steersman::simulator::{
-    Camera, DriveState, Driver, Expert, HEIGHT, Mount, Renderer, RgbFrame, RunOptions, Simulation, Speed, Start, Track,
-    Variant, WIDTH,
+    Camera, DriveState, Driver, Expert, Mount, Renderer, RgbFrame, RunOptions, Simulation, Speed, Start, Track, Variant,
 };
 use steersman_kernels::Isa;
 
@@ -61,7 +60,7 @@ struct Watching(Option<Pilot>);
 impl Driver for Watching {
     fn steer(&mut self, frame: &RgbFrame, state: &DriveState) -> f32 {
         if let Some(pilot) = &mut self.0 {
-            black_box(pilot.steer(HEIGHT, WIDTH, &frame.pixels)).expect("a picture of the right size");
+            black_box(pilot.steer(frame.view())).expect("a picture of the right size");
         }
         black_box(frame);
         Expert.steer(frame, state)

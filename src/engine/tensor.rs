@@ -32,17 +32,22 @@ impl Shape {
         Shape { c: units, h: 1, w: 1 }
     }
 
-    /// How many numbers one image has.
+    /// Shape of an array of `n` images: `(n, c, h, w)`.
+    pub const fn batch(self, n: usize) -> (usize, usize, usize, usize) {
+        (n, self.c, self.h, self.w)
+    }
+
+    /// Length of one image: c · h · w.
     pub const fn len(self) -> usize {
         self.c * self.h * self.w
     }
 
-    /// Whether there is no number at all.
+    /// Whether an image is empty.
     pub const fn is_empty(self) -> bool {
         self.len() == 0
     }
 
-    /// How many positions each channel has.
+    /// Positions of a channel: h · w.
     pub const fn positions(self) -> usize {
         self.h * self.w
     }

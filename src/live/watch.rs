@@ -97,7 +97,7 @@ impl DriveObserver for Watch<'_> {
         jpeg::encode(frame.picture, &mut self.camera)?;
         let mut excited = Vec::new();
         if let Some((pilot, saliency)) = &mut self.saliency {
-            saliency.steer(pilot, HEIGHT, WIDTH, &frame.picture.pixels)?;
+            saliency.steer(pilot, frame.picture.view())?;
             self.image.pixels.copy_from_slice(&frame.picture.pixels);
             saliency.overlay(&pilot.recipe().preprocessing, &mut self.image);
             excited = self.image.to_jpeg();

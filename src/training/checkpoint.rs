@@ -132,7 +132,7 @@ mod tests {
         let spec = OptimizerSpec::Sgd { learning_rate: 0.1, momentum: 0.9, l2: 0.0, decoupled_weight_decay: 0.0 };
         let mut state = State {
             parameters: network.initialize(1),
-            optimizer: Optimizer::new(spec, None, &network),
+            optimizer: Optimizer::new(spec, None, network.tensors(), network.isa()),
             best: Some(network.initialize(2)),
             progress: Progress { epoch: 3, loss_sum: 0.1 + 0.2, best_val_mse: Some(1.0 / 3.0), ..Progress::default() },
         };
@@ -141,7 +141,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("checkpoint.safetensors");
         state.save(&path, &network).unwrap();
-        let read = State::load(&path, &network, Optimizer::new(spec, None, &network)).unwrap();
+        let read = State::load(&path, &network, Optimizer::new(spec, None, network.tensors(), network.isa())).unwrap();
         assert_eq!(read.parameters, state.parameters);
         assert_eq!(read.best, state.best);
         assert_eq!(read.progress, state.progress);

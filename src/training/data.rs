@@ -3,16 +3,23 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use ndarray::ArrayView4;
 use sha2::{Digest, Sha256};
 
 use crate::dataset::cache::{CacheSpec, Overflow};
 use crate::dataset::leak::LeakAudit;
-use crate::dataset::loader::{Loader, LoaderSpec};
+use crate::dataset::loader::{Batch, Loader, LoaderSpec};
 use crate::dataset::split::{Split, split};
 use crate::dataset::{self, Item, Recording};
+use crate::engine::tensor::Shape;
 use crate::error::{Error, Result};
 use crate::files::atomic_file;
 use crate::recipe::Recipe;
+
+/// The images of `batch`, `(n, c, h, w)`, for a network whose input is `input`.
+pub(super) fn images(input: Shape, batch: &Batch) -> ArrayView4<'_, f32> {
+    ArrayView4::from_shape(input.batch(batch.n), &batch.x).expect("a loader makes images of the network's input shape")
+}
 
 /// Recordings that have been read and split.
 #[derive(Debug)]

@@ -6,7 +6,7 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use super::history::{EpochRecord, read_history};
-use super::session::TrainResult;
+use super::run::TrainResult;
 use crate::error::{Error, Result};
 use crate::files::atomic_file;
 use crate::model_file::Transfer;

@@ -1,5 +1,8 @@
 //! The held-out side, after each epoch.
 
+use ndarray::ArrayViewMut1;
+
+use super::data;
 use crate::dataset::Camera;
 use crate::dataset::leak::NearTwins;
 use crate::dataset::loader::{Batch, Loader, LoaderTimes};
@@ -77,7 +80,14 @@ impl Validation {
             // While the network looks at one batch, the next one is prepared.
             let predictions = &mut predictions[..current.n];
             let ((), filled) = rayon::join(
-                || plan.run(network, parameters, &current.x, predictions),
+                || {
+                    plan.run(
+                        network,
+                        parameters,
+                        data::images(network.input(), current),
+                        ArrayViewMut1::from(&mut *predictions),
+                    )
+                },
                 || if batch + 1 < loader.batches() { loader.fill(batch + 1, next) } else { Ok(()) },
             );
             filled?;

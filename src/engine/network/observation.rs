@@ -1,11 +1,11 @@
-//! Evaluation of one image layer by layer, so that what each layer makes of it can be looked at.
+//! Evaluation of one image layer by layer, for whoever looks at the output of each layer.
 
 use super::{Network, Parameters};
 
 /// The buffers of an evaluation that shows the output of every layer. [`InferencePlan`](super::InferencePlan), which runs
 /// neighbouring layers as one, is faster and sees only the last.
 #[derive(Clone, Debug)]
-pub struct ObservationPlan {
+pub(crate) struct ObservationPlan {
     /// Input and output of a layer.
     buffers: [Vec<f32>; 2],
     scratch: Vec<f32>,
@@ -13,20 +13,20 @@ pub struct ObservationPlan {
 
 impl ObservationPlan {
     /// Buffers for one image at a time.
-    pub fn new(network: &Network) -> ObservationPlan {
+    pub(crate) fn new(network: &Network) -> ObservationPlan {
         let layers = network.layers();
         let largest = layers.iter().map(|l| l.layer.output().len()).max().unwrap_or(0);
         let scratch = layers.iter().map(|l| l.layer.scratch_len(1)).max().unwrap_or(0);
         ObservationPlan { buffers: [vec![0.0; largest], vec![0.0; largest]], scratch: vec![0.0; scratch] }
     }
 
-    /// Runs the network on the image `x`, `[c][h][w]`, fills `y`, `[outputs]`, and tells `seen` the place and the output of
-    /// each layer that computes something.
+    /// Runs the network on the image `x`, `[c][h][w]`, fills `y`, `[outputs]`, and calls `seen` with the index in
+    /// [`Network::layers`] and the output of each layer that computes something.
     ///
     /// # Panics
     ///
     /// Panics if the lengths do not fit the network.
-    pub fn run(
+    pub(crate) fn run(
         &mut self,
         network: &Network,
         parameters: &Parameters,

@@ -226,10 +226,10 @@ pub fn examine(
     let look = |(pilot, projector, image, changed): &mut (Pilot, Projector, RgbImage, RgbImage), i: usize| {
         footage.picture(i, projector, image)?;
         let mut answers = [0.0f32; Change::ALL.len() + 1];
-        answers[0] = pilot.steer(image.height, image.width, &image.pixels)?;
+        answers[0] = pilot.steer(image.view())?;
         for (change, answer) in Change::ALL.into_iter().zip(&mut answers[1..]) {
             change.apply(image, changed);
-            *answer = pilot.steer(changed.height, changed.width, &changed.pixels)?;
+            *answer = pilot.steer(changed.view())?;
         }
         let count = done.fetch_add(1, std::sync::atomic::Ordering::Relaxed) + 1;
         if progress(count as f64 / footage.len() as f64) { Ok(answers) } else { Err(Error::Interrupted) }

@@ -4,11 +4,12 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
+use ndarray::ArrayView1;
 use serde::{Deserialize, Serialize};
 use steersman_kernels::Isa;
 
 use super::checkpoint::{Progress, State};
-use super::data::Data;
+use super::data::{Data, images};
 use super::history::{EpochRecord, write_history};
 use super::profile::{Profile, ProfileReport};
 use super::run_folder::{RunFolder, RunInfo};
@@ -16,7 +17,7 @@ use super::transfer::{Start, TransferRequest};
 use super::validation::{Validation, ValidationResult};
 use crate::dataset::held_out::held_out_tracks;
 use crate::dataset::loader::{Batch, Loader};
-use crate::engine::network::{Network, StepInput, TrainingPlan};
+use crate::engine::network::{Network, Parameters, StepInput, TrainingPlan};
 use crate::engine::optimizer::Optimizer;
 use crate::engine::stopwatch::Stopwatch;
 use crate::error::{Error, Result};
@@ -24,8 +25,8 @@ use crate::files::atomic_file;
 use crate::model_file::{Model, TrainingRecord, weights_hash};
 use crate::recipe::{Keep, Recipe};
 
-/// Most images of one row: three cameras, each mirrored. A batch of whole rows has at least one row.
-const IMAGES_OF_A_ROW: usize = 6;
+/// Maximum of images of one row: three cameras, each mirrored. A batch of whole rows has at least one row.
+const MAX_ROW_IMAGES: usize = 6;
 
 /// What to train on, and how.
 #[derive(Clone, Debug)]
@@ -135,8 +136,8 @@ pub fn train(request: TrainRequest, observer: &mut dyn Observer, stop: &AtomicBo
     }
     data.write_split(&folder.file("split.csv"))?;
     folder.write_json("run.json", &info)?;
-    let session = Session::new(folder, info, recipe, data, start, started)?;
-    session.measured(profile).run(observer, stop)
+    let run = TrainingRun::new(folder, info, recipe, data, start, started)?;
+    run.measured(profile).run(observer, stop)
 }
 
 /// Goes on with the run in `path`, as if it had never stopped; prints the result again if it is finished.
@@ -169,12 +170,12 @@ pub fn resume(path: &Path, observer: &mut dyn Observer, stop: &AtomicBool) -> Re
     }
     let from = info.transfer.as_ref().map(TransferRequest::of);
     let start = from.map(|from| Start::load(&folder.from(), &from, &recipe, info.seed)).transpose()?;
-    let mut session = Session::new(folder, info, recipe, data, start, started)?;
-    session.restore()?;
-    session.measured(profile).run(observer, stop)
+    let mut run = TrainingRun::new(folder, info, recipe, data, start, started)?;
+    run.restore()?;
+    run.measured(profile).run(observer, stop)
 }
 
-struct Session {
+struct TrainingRun {
     folder: RunFolder,
     info: RunInfo,
     recipe: Recipe,
@@ -190,7 +191,7 @@ struct Session {
     profile: Option<Profile>,
 }
 
-impl Session {
+impl TrainingRun {
     fn new(
         folder: RunFolder,
         info: RunInfo,
@@ -198,12 +199,12 @@ impl Session {
         data: Data,
         start: Option<Start>,
         started: Instant,
-    ) -> Result<Session> {
+    ) -> Result<TrainingRun> {
         let mut network = recipe.network(Isa::best())?;
         if let Some(start) = &start {
             network.freeze(&start.transfer.frozen)?;
         }
-        let optimizer = Optimizer::new(recipe.optimizer, recipe.clip_gradient_norm, &network);
+        let optimizer = Optimizer::new(recipe.optimizer, recipe.clip_gradient_norm, network.tensors(), network.isa());
         let (leak_percent, mut training_rows) = (data.leak_percent(), data.training_row_ids());
         let mut notices = data.notices().to_vec();
         let parameters = match start {
@@ -219,8 +220,8 @@ impl Session {
         let (training, validation) = data.into_loaders()?;
         // No batch is larger than a side has samples, whatever the recipe asks for.
         let most = training.samples().max(validation.as_ref().map_or(0, Loader::samples));
-        let capacity = recipe.batch.min(most).max(IMAGES_OF_A_ROW);
-        Ok(Session {
+        let capacity = recipe.batch.min(most).max(MAX_ROW_IMAGES);
+        Ok(TrainingRun {
             plan: TrainingPlan::new(&network, capacity),
             validation: validation.map(|loader| Validation::new(loader, &network, capacity, recipe.full_lock_deg)),
             state: State { parameters, optimizer, best: None, progress: Progress::default() },
@@ -237,8 +238,8 @@ impl Session {
         })
     }
 
-    /// The session, with `profile` measuring what it does from now on.
-    fn measured(mut self, profile: Option<Profile>) -> Session {
+    /// The run, with `profile` measuring what it does from now on.
+    fn measured(mut self, profile: Option<Profile>) -> TrainingRun {
         if let Some(profile) = &profile {
             self.training.measure(&profile.loading);
             self.plan.measure(profile.update.clone());
@@ -247,7 +248,7 @@ impl Session {
                 validation.measure(&profile.loading, profile.evaluation.clone());
             }
         }
-        Session { profile, ..self }
+        TrainingRun { profile, ..self }
     }
 
     /// Takes the state over from the last checkpoint, if there is one.
@@ -327,7 +328,8 @@ impl Session {
                     if current.n == 0 {
                         return (0.0, Instant::now());
                     }
-                    let input = StepInput { x: &current.x, labels: &current.labels, seed: self.info.seed, step };
+                    let (x, labels) = (images(network.input(), current), ArrayView1::from(&current.labels));
+                    let input = StepInput { x, labels, seed: self.info.seed, step };
                     (plan.step(network, parameters, loss, input), Instant::now())
                 },
                 || if following < batches { training.fill(following, next) } else { Ok(()) },
@@ -432,7 +434,7 @@ impl Session {
     }
 
     /// The weights after `epoch` (from 1) as a model.
-    fn model(&self, parameters: &crate::engine::network::Parameters, epoch: u32) -> Model {
+    fn model(&self, parameters: &Parameters, epoch: u32) -> Model {
         let record = self.state.progress.history[epoch as usize - 1];
         Model {
             recipe: self.recipe.clone(),
