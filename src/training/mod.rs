@@ -27,7 +27,7 @@ pub use checkpoint::{Progress, State};
 pub use data::Data;
 pub use history::{EpochRecord, read_history, write_history};
 pub use profile::ProfileReport;
-pub use run::{Observer, TrainRequest, TrainResult, resume, train};
+pub use run::{TrainRequest, TrainResult, TrainingEvent, resume, train};
 pub use run_folder::{RunFolder, RunInfo};
 pub use transfer::TransferRequest;
 pub use validation::{Validation, ValidationResult};

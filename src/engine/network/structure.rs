@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::ops::Range;
 
-use steersman_kernels::Isa;
+use steersman_kernels::{Backend, Isa};
 
 use super::LayerSpec;
 use crate::engine::layers::Layer;
@@ -20,7 +20,7 @@ pub struct Network {
     input: Shape,
     layers: Vec<NamedLayer>,
     tensors: Vec<Tensor>,
-    isa: Isa,
+    backend: Backend,
     fingerprint: u64,
 }
 
@@ -42,19 +42,21 @@ pub struct NamedLayer {
 }
 
 impl Network {
-    /// The network of `specs` over images of `input`, with the vector code of `isa`.
+    /// The network of `specs` over images of `input`, computed with `backend`: an [`Isa`], or one with a convolution algorithm.
     ///
     /// # Errors
     ///
     /// [`Error::Network`] names the first layer that does not fit and says why.
-    pub fn new(input: Shape, specs: &[LayerSpec], isa: Isa) -> Result<Network> {
-        let mut network = Network { input, layers: Vec::new(), tensors: Vec::new(), isa, fingerprint: 0 };
+    pub fn new(input: Shape, specs: &[LayerSpec], backend: impl Into<Backend>) -> Result<Network> {
+        let backend = backend.into();
+        let mut network = Network { input, layers: Vec::new(), tensors: Vec::new(), backend, fingerprint: 0 };
         let (mut params_end, mut statistics_end) = (0, 0);
         for (index, spec) in specs.iter().enumerate() {
             let same_kind = specs[..index].iter().filter(|other| other.base_name() == spec.base_name()).count();
             let name = format!("{}{}", spec.base_name(), same_kind + 1);
-            let layer =
-                spec.build(network.output(), isa).map_err(|message| Error::Network { layer: name.clone(), message })?;
+            let layer = spec
+                .build(network.output(), backend)
+                .map_err(|message| Error::Network { layer: name.clone(), message })?;
             let (params_start, statistics_start) = (params_end, statistics_end);
             for (specs, end, trainable) in
                 [(layer.params(), &mut params_end, true), (layer.statistics(), &mut statistics_end, false)]
@@ -85,7 +87,7 @@ impl Network {
         Ok(network)
     }
 
-    /// A hash over everything that a plan depends on: input shape, layers and their options, frozen layers, vector code.
+    /// A hash over everything that a plan depends on: input shape, layers and their options, frozen layers, backend.
     /// Networks that are built alike have the same.
     pub(crate) fn fingerprint(&self) -> u64 {
         self.fingerprint
@@ -93,7 +95,7 @@ impl Network {
 
     fn hash_structure(&self) -> u64 {
         let mut hasher = DefaultHasher::new();
-        (self.input, self.isa.name()).hash(&mut hasher);
+        (self.input, format!("{:?}", self.backend)).hash(&mut hasher);
         for layer in &self.layers {
             // The text of a specification has all of its options, numbers to the last bit.
             (format!("{:?}", layer.spec), &layer.params, &layer.statistics, layer.frozen).hash(&mut hasher);
@@ -136,7 +138,12 @@ impl Network {
 
     /// The vector code the network runs on.
     pub fn isa(&self) -> Isa {
-        self.isa
+        self.backend.isa
+    }
+
+    /// What the network is computed with.
+    pub fn backend(&self) -> Backend {
+        self.backend
     }
 
     /// Freezes the layers called `names`: training changes neither their parameters nor their running statistics, and their batch
