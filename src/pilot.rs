@@ -89,12 +89,12 @@ impl Pilot {
         })
     }
 
-    /// How the model was made.
+    /// The recipe of the model.
     pub fn recipe(&self) -> &Recipe {
         &self.about.recipe
     }
 
-    /// Held-out tracks that the model was trained on all the same.
+    /// Held-out tracks that the model was trained on nevertheless.
     pub fn trained_on_held_out(&self) -> &[String] {
         &self.about.trained_on_held_out
     }
@@ -104,7 +104,7 @@ impl Pilot {
         self.predictor.network()
     }
 
-    /// The numbers of the network.
+    /// The parameters of the network.
     pub fn parameters(&self) -> &Parameters {
         self.predictor.parameters()
     }

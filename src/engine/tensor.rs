@@ -60,7 +60,7 @@ impl fmt::Display for Shape {
     }
 }
 
-/// How a tensor gets its first values.
+/// Initial values of a tensor.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum Initializer {
@@ -73,7 +73,7 @@ pub enum Initializer {
     Constant(f32),
 }
 
-/// How many inputs feed, and how many outputs are fed by, one element of a weight tensor.
+/// Number of inputs that feed one output (fan-in), and of outputs that one input feeds (fan-out).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Fans {
     /// Inputs of one output: input channels times kernel positions.

@@ -75,7 +75,7 @@ pub enum TrainingEvent {
     },
 }
 
-/// What a run came to; `train --json` prints it.
+/// The result of a run; `train --json` prints it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TrainResult {
@@ -282,7 +282,7 @@ impl TrainingRun {
         TrainingRun { profile, ..self }
     }
 
-    /// Takes the state over from the last checkpoint, if there is one.
+    /// Restores the state of the last checkpoint, if there is one.
     fn restore(&mut self) -> Result<()> {
         let path = self.folder.file("checkpoint.safetensors");
         if path.is_file() {
@@ -330,7 +330,7 @@ impl TrainingRun {
         self.finish()
     }
 
-    /// Trains the rest of the epoch under way.
+    /// Trains on the remaining batches of the current epoch.
     fn train_epoch(
         &mut self,
         [current, next]: &mut [Batch; 2],
@@ -355,7 +355,7 @@ impl TrainingRun {
             let step = u64::from(epoch) * batches as u64 + batch as u64;
             let State { parameters, optimizer, progress, .. } = &mut self.state;
             let (network, plan, loss) = (&self.network, &mut self.plan, &self.recipe.loss);
-            // While the network learns from one batch, the next one is prepared.
+            // The next batch is loaded while the network trains on this one.
             let ((mean_loss, step_done), filled) = rayon::join(
                 || {
                     if current.n == 0 {
@@ -424,7 +424,7 @@ impl TrainingRun {
         progress.epoch += 1;
         (progress.next_batch, progress.loss_sum, progress.images, progress.train_seconds) = (0, 0.0, 0, 0.0);
 
-        // Without a validation side the latest weights are the best there are; so they are if the recipe says so.
+        // Without a validation side, or with `keep = "last"`, the latest weights count as the best.
         let better = match (record.val_mse, progress.best_val_mse) {
             (Some(now), Some(before)) => now < before || self.recipe.keep == Keep::Last,
             _ => true,
@@ -463,7 +463,7 @@ impl TrainingRun {
         if let Some(best) = &self.state.best {
             let progress = &self.state.progress;
             self.model(best, progress.best_epoch).save(&self.folder.model())?;
-            // In the middle of an epoch the weights belong to no epoch's figures; the checkpoint has them.
+            // In the middle of an epoch the weights have no measures of their own; only the checkpoint stores them.
             if progress.next_batch == 0 {
                 self.model(&self.state.parameters, epoch).save(&self.folder.file("last.safetensors"))?;
             }
@@ -494,7 +494,7 @@ impl TrainingRun {
         }
     }
 
-    /// What is only known once every image has been decoded.
+    /// Reports what is known only after every image has been decoded: unreadable images and near twins.
     fn report_images(&self, observer: &mut dyn Observer<TrainingEvent>) -> Result<()> {
         let sides = [Some(self.training.undecodable()), self.validation.as_ref().map(Validation::undecodable)];
         for (count, examples) in sides.into_iter().flatten().filter(|(count, _)| *count > 0) {

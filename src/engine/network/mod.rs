@@ -29,7 +29,8 @@ pub use predictor::Predictor;
 pub use spec::LayerSpec;
 pub use step_input::StepInput;
 pub use step_profile::StageTime;
-pub use structure::{NamedLayer, Network, group_digits};
+pub(crate) use structure::group_digits;
+pub use structure::{NamedLayer, Network};
 pub use training::TrainingPlan;
 
 pub use crate::engine::parameters::{Parameters, Tensor};

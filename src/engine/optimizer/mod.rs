@@ -21,7 +21,7 @@ use steersman_kernels::update::{AdamStep, adam, scale, sgd_momentum};
 use crate::engine::parameters::{CHUNK, Tensor};
 use crate::engine::stopwatch::Stopwatch;
 
-/// How parameters follow the gradient.
+/// The algorithm that updates parameters along the gradient.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
 pub enum OptimizerSpec {
@@ -83,7 +83,7 @@ impl OptimizerSpec {
         }
     }
 
-    /// What is wrong with the numbers, if anything is.
+    /// Checks the ranges of all numbers; the error names the first that is wrong.
     pub fn check(&self) -> Result<(), String> {
         let (positive, fractions, not_negative) = match *self {
             OptimizerSpec::Adam { learning_rate, beta1, beta2, epsilon, l2, decoupled_weight_decay } => (
@@ -179,7 +179,7 @@ impl Optimizer {
         }
     }
 
-    /// Adds the time that updates take from now on to `time`.
+    /// Measures from now on: adds the time of updates to `time`.
     pub fn measure(&mut self, time: Stopwatch) {
         self.time = time;
     }
