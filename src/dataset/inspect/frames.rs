@@ -5,8 +5,8 @@ use std::hash::{DefaultHasher, Hash, Hasher};
 
 use rayon::prelude::*;
 
-use super::super::recording::{Camera, Recording};
 use crate::Result;
+use crate::dataset::recording::{Recording, View};
 use crate::observer::{Observer, Progress, Tally};
 use crate::picture::{RgbImage, decode::decode_rgb};
 
@@ -134,7 +134,7 @@ struct Eye {
 impl Eye {
     fn look(&mut self, recording: &Recording, row: usize) -> Option<Sketch> {
         use std::io::Read as _;
-        let path = recording.image_path(row, Camera::Centre)?;
+        let path = recording.image_path(row, View::Centre)?;
         self.file.clear();
         std::fs::File::open(path).ok()?.read_to_end(&mut self.file).ok()?;
         decode_rgb(&self.file, &mut self.image).ok()?;

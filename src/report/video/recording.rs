@@ -6,7 +6,7 @@ use super::film::{Video, ended_early};
 use super::onlooker::Onlooker;
 use super::painter::{Captions, FilmFrame, Painter};
 use super::summary::VideoSummary;
-use crate::dataset::{self, Camera, Recording};
+use crate::dataset::{self, Recording, View};
 use crate::error::{Error, Result};
 use crate::observer::{Observer, Progress};
 use crate::picture::decode::decode_rgb;
@@ -81,7 +81,7 @@ fn name(path: &Path) -> String {
 }
 
 fn read(recording: &Recording, row: usize, frame: &mut FilmFrame) -> Result<()> {
-    let path = recording.image_path(row, Camera::Centre);
+    let path = recording.image_path(row, View::Centre);
     let path =
         path.ok_or_else(|| Error::data(&recording.path, format!("row {row} has no picture of the centre camera")))?;
     let bytes = std::fs::read(&path).map_err(Error::io(&path))?;

@@ -5,9 +5,10 @@ mod frames;
 mod lag;
 mod suspicious;
 
-use super::load::{ImageCheck, load_with};
-use super::recording::{Camera, Kind, Recording, Row, Unusable};
 use crate::Result;
+use crate::dataset::load::{ImageCheck, load_with};
+use crate::dataset::recording::{Kind, Recording, Row, View};
+use crate::dataset::unusable::Unusable;
 use crate::observer::{Observer, Progress};
 pub use frames::Frame;
 pub use lag::Lag;
@@ -55,7 +56,7 @@ pub struct Report {
     /// Whether the times come from the recording; otherwise rows count as 20 Hz.
     pub times_plausible: bool,
     /// Cameras that have images.
-    pub cameras: Vec<Camera>,
+    pub cameras: Vec<View>,
     /// Height and width of the first image.
     pub image_size: Option<[usize; 2]>,
     /// The labels; `None` without rows.
@@ -213,7 +214,7 @@ fn describe(path: &Path, recording: &Recording, frames: &[Option<Frame>]) -> Rep
         span_s: span_ms as f64 / 1000.0,
         rate_hz: recording.rate_hz(),
         times_plausible: recording.times_plausible,
-        cameras: Camera::ALL.into_iter().filter(|&camera| recording.has(camera)).collect(),
+        cameras: View::ALL.into_iter().filter(|&camera| recording.has(camera)).collect(),
         image_size: recording.image_size,
         steering: describe_steering(rows),
         throttle: Spread::of(rows.iter().map(|row| row.throttle)),
