@@ -75,14 +75,15 @@
 //!
 //! ```
 //! use ndarray::{arr1, arr2};
-//! use steersman::engine::network::{LayerSpec, Network, StepInput, TrainingPlan};
+//! use steersman::engine::layers::DenseSpec;
+//! use steersman::engine::network::{Network, StepInput, TrainingPlan};
 //! use steersman::engine::optimizer::{Optimizer, OptimizerSpec};
 //! use steersman::engine::tensor::{Initializer, Shape};
 //! use steersman::engine::loss::Loss;
 //! use steersman_kernels::Isa;
 //!
 //! // y = x1 − x2, learned by one dense layer.
-//! let layers = [LayerSpec::Dense { units: 1, init: Initializer::GlorotUniform }];
+//! let layers = [DenseSpec { units: 1, init: Initializer::GlorotUniform }.into()];
 //! let network = Network::new(Shape::vector(2), &layers, Isa::best())?;
 //! let (x, labels) = (arr2(&[[1.0, 0.0], [0.0, 1.0], [1.0, 1.0], [0.5, 1.0]]), arr1(&[1.0, -1.0, 0.0, -0.5]));
 //! let x = x.into_shape_with_order((4, 2, 1, 1)).unwrap(); // a vector of 2 is an image of 2 channels, 1 row, 1 column
@@ -168,8 +169,11 @@ pub mod recipe;
 pub mod report;
 pub mod serve;
 pub mod simulator;
+pub mod simulator_client;
+mod statistics;
 mod suggest;
 mod text;
 pub mod training;
+pub mod udacity;
 
 pub use error::{Error, Result};

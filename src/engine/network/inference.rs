@@ -7,8 +7,8 @@ use rayon::prelude::*;
 
 use super::fused::{FusedStage, Kind, stages};
 use super::step_input::image_slice;
-use super::{LayerSpec, Network, Parameters};
-use crate::engine::layers::Prepared;
+use super::{Network, Parameters};
+use crate::engine::layers::{Family, Packing};
 use crate::engine::stopwatch::Stopwatch;
 use crate::engine::tensor::Shape;
 use crate::error::{Error, Result};
@@ -26,7 +26,7 @@ pub struct InferencePlan {
     /// Number of stages before the first dense layer.
     maps: usize,
     /// The packed weights of each stage; empty for stages without any.
-    prepared: Vec<Vec<f32>>,
+    packed: Vec<Vec<f32>>,
     workers: Vec<Worker>,
     capacity: usize,
     /// [`Network::fingerprint`] of the network it was planned for.
@@ -52,8 +52,7 @@ impl InferencePlan {
     pub fn new(network: &Network, capacity: usize) -> InferencePlan {
         let group = capacity.clamp(1, GROUP);
         let stages = stages(network);
-        let is_dense =
-            |stage: &FusedStage| matches!(network.layers()[stage.layers.start].spec, LayerSpec::Dense { .. });
+        let is_dense = |stage: &FusedStage| network.layers()[stage.layers.start].spec.family() == Family::Dense;
         let maps = stages.iter().position(is_dense).unwrap_or(stages.len());
         let largest = |stages: &[FusedStage]| stages.iter().map(|stage| stage.output_len(network)).max().unwrap_or(0);
         let between = stages[..maps].last().map_or(0, |stage| stage.output_len(network));
@@ -65,9 +64,9 @@ impl InferencePlan {
             group: [vec![0.0; after], vec![0.0; after]],
             scratch: vec![0.0; scratch],
         };
-        let prepared_len = |stage: &FusedStage| stage.prepared(network).map_or(0, |prepared| prepared.prepared_len());
+        let packed_len = |stage: &FusedStage| stage.packing(network).map_or(0, |packing| packing.packed_len());
         InferencePlan {
-            prepared: stages.iter().map(|stage| vec![0.0; prepared_len(stage)]).collect(),
+            packed: stages.iter().map(|stage| vec![0.0; packed_len(stage)]).collect(),
             workers: (0..capacity.div_ceil(group)).map(|_| worker()).collect(),
             stages,
             maps,
@@ -99,9 +98,9 @@ impl InferencePlan {
     pub(super) fn pack(&mut self, network: &Network, parameters: &Parameters) {
         assert_eq!(self.fingerprint, network.fingerprint(), "an inference plan for another network");
         network.check_parameters(parameters);
-        for (stage, to) in self.stages.iter().zip(&mut self.prepared) {
-            if let Some(prepared) = stage.prepared(network) {
-                prepared.prepare(&parameters.values[stage.params(network)], to);
+        for (stage, to) in self.stages.iter().zip(&mut self.packed) {
+            if let Some(packing) = stage.packing(network) {
+                packing.pack(&parameters.values[stage.params(network)], to);
             }
         }
     }
@@ -120,8 +119,8 @@ impl InferencePlan {
         assert!(n <= self.capacity, "a batch of {n} images in a plan for {}", self.capacity);
         let y = y.as_slice_mut().expect("predictions must be contiguous");
         assert_eq!(y.len(), n * output, "predictions of a batch of {n} images");
-        let InferencePlan { stages, maps, prepared, workers, time, .. } = self;
-        let context = InferenceContext { network, parameters, stages, maps: *maps, prepared };
+        let InferencePlan { stages, maps, packed, workers, time, .. } = self;
+        let context = InferenceContext { network, parameters, stages, maps: *maps, packed };
         if n <= GROUP {
             for ((x, y), worker) in x.chunks(GROUP * input).zip(y.chunks_mut(GROUP * output)).zip(workers) {
                 time.time(|| context.group(worker, x, y));
@@ -142,7 +141,7 @@ struct InferenceContext<'a> {
     parameters: &'a Parameters,
     stages: &'a [FusedStage],
     maps: usize,
-    prepared: &'a [Vec<f32>],
+    packed: &'a [Vec<f32>],
 }
 
 impl InferenceContext<'_> {
@@ -189,12 +188,12 @@ impl InferenceContext<'_> {
         let params = &self.parameters.values[stage.params(self.network)];
         let statistics = &self.parameters.statistics[first.statistics.clone()];
         match &stage.kind {
-            Kind::Layer => match first.layer.prepared() {
-                Some(layer) => layer.infer_prepared(&self.prepared[index], n, x, y, scratch),
+            Kind::Layer => match first.layer.packing() {
+                Some(layer) => layer.infer_packed(&self.packed[index], n, x, y, scratch),
                 None => first.layer.infer(params, statistics, n, x, y, scratch),
             },
             Kind::NormRectify(fused) => fused.infer(params, statistics, n, x, y, scratch),
-            Kind::PooledConv(fused) => fused.infer_prepared(&self.prepared[index], n, x, y, scratch),
+            Kind::PooledConv(fused) => fused.infer_packed(&self.packed[index], n, x, y, scratch),
         }
     }
 }

@@ -16,7 +16,7 @@ pub(super) struct StepContext<'a> {
     pub network: &'a Network,
     pub parameters: &'a Parameters,
     pub stages: &'a [FusedStage],
-    pub prepared: &'a [Vec<f32>],
+    pub packed: &'a [Vec<f32>],
     pub moments: &'a [f32],
     pub moments_of: &'a [Range<usize>],
     pub first_learning: usize,
@@ -28,14 +28,7 @@ impl<'a> StepContext<'a> {
     fn pass(&self, stage: usize, first_image: usize) -> Pass<'a> {
         let moments = &self.moments[self.moments_of[stage].clone()];
         let layer = self.stages[stage].layers.start;
-        Pass {
-            seed: self.input.seed,
-            step: self.input.step,
-            layer,
-            first_image,
-            moments,
-            prepared: &self.prepared[stage],
-        }
+        Pass { seed: self.input.seed, step: self.input.step, layer, first_image, moments, packed: &self.packed[stage] }
     }
 
     fn params(&self, stage: usize) -> &'a [f32] {

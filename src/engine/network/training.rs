@@ -57,7 +57,7 @@ pub struct TrainingPlan {
     chunk_squares: Vec<f64>,
     stages: Vec<FusedStage>,
     /// The packed weights of each stage, made anew in every step.
-    prepared: Vec<Vec<f32>>,
+    packed: Vec<Vec<f32>>,
     /// Means and variances of the batch from the barriers, all stages one after the other.
     moments: Vec<f32>,
     /// Where each stage's part of `moments` lies.
@@ -151,9 +151,9 @@ impl TrainingPlan {
             chunk_squares: vec![0.0; network.count(true).div_ceil(CHUNK)],
             first_learning: stages.iter().position(|stage| stage.learns(network)).unwrap_or(stages.len()),
             times: StepTimes::off(stages.len()),
-            prepared: stages
+            packed: stages
                 .iter()
-                .map(|stage| stage.prepared(network).map_or(0, |prepared| prepared.prepared_for_training_len()))
+                .map(|stage| stage.packing(network).map_or(0, |packing| packing.training_packed_len()))
                 .map(|len| vec![0.0; len])
                 .collect(),
             stages,
@@ -214,7 +214,7 @@ impl TrainingPlan {
             shard.images = index * shard_images..((index + 1) * shard_images).min(n);
         }
         self.freeze_moments(network, parameters);
-        self.prepare(network, parameters);
+        self.pack(network, parameters);
         if self.segments.len() == 1 {
             self.step_without_barriers(network, parameters, loss, input, used);
         } else {
@@ -225,10 +225,10 @@ impl TrainingPlan {
     }
 
     /// Packs the weights once for all shards.
-    fn prepare(&mut self, network: &Network, parameters: &Parameters) {
-        self.prepared.par_iter_mut().zip(&self.stages).for_each(|(to, stage)| {
-            if let Some(prepared) = stage.prepared(network) {
-                prepared.prepare_for_training(&parameters.values[stage.params(network)], to);
+    fn pack(&mut self, network: &Network, parameters: &Parameters) {
+        self.packed.par_iter_mut().zip(&self.stages).for_each(|(to, stage)| {
+            if let Some(packing) = stage.packing(network) {
+                packing.pack_for_training(&parameters.values[stage.params(network)], to);
             }
         });
     }
@@ -258,7 +258,7 @@ impl TrainingPlan {
             spare_buffers,
             spare_scratch,
             stages,
-            prepared,
+            packed,
             moments,
             moments_of,
             first_learning,
@@ -267,7 +267,7 @@ impl TrainingPlan {
         } = self;
         let first_learning = *first_learning;
         let run =
-            StepContext { network, parameters, stages, prepared, moments, moments_of, first_learning, input, times };
+            StepContext { network, parameters, stages, packed, moments, moments_of, first_learning, input, times };
         shards[..used].par_iter_mut().for_each(|shard| {
             shard.reset();
             shard.buffers = spare_buffers.take();
@@ -296,7 +296,7 @@ impl TrainingPlan {
             shards,
             spare_scratch,
             stages,
-            prepared,
+            packed,
             moments,
             moments_of,
             sums,
@@ -315,17 +315,8 @@ impl TrainingPlan {
         let last = segments.len() - 1;
 
         for (index, segment) in segments.iter().enumerate() {
-            let run = StepContext {
-                network,
-                parameters,
-                stages,
-                prepared,
-                moments,
-                moments_of,
-                first_learning,
-                input,
-                times,
-            };
+            let run =
+                StepContext { network, parameters, stages, packed, moments, moments_of, first_learning, input, times };
             let next_barrier = segments.get(index + 1).map(|next| next.start);
             shards.par_iter_mut().for_each(|shard| {
                 if index == 0 {
@@ -356,17 +347,8 @@ impl TrainingPlan {
             }
         }
         for (index, segment) in segments.iter().enumerate().rev() {
-            let run = StepContext {
-                network,
-                parameters,
-                stages,
-                prepared,
-                moments,
-                moments_of,
-                first_learning,
-                input,
-                times,
-            };
+            let run =
+                StepContext { network, parameters, stages, packed, moments, moments_of, first_learning, input, times };
             // The stage at the start of a segment waits for the sums over all shards.
             let rest = if index > 0 { segment.start + 1..segment.end } else { segment.clone() };
             shards.par_iter_mut().for_each(|shard| {

@@ -17,7 +17,9 @@ use norm_rectify::NormRectify;
 use pooled_conv::{MonotonicActivation, PooledConv};
 
 use super::{LayerSpec, NamedLayer, Network};
-use crate::engine::layers::{BatchNorm, BatchStatistics, Conv2d, Prepared, Slopes};
+use crate::engine::layers::{
+    BatchNorm, BatchNormSpec, BatchStatistics, Conv2d, Conv2dSpec, EluSpec, MaxPoolSpec, PReluSpec, Packing, Slopes,
+};
 
 /// Neighbouring layers that run as one; most stages are a single layer.
 #[derive(Clone, Debug)]
@@ -80,10 +82,10 @@ impl FusedStage {
         }
     }
 
-    /// Its passes with prepared parameters, if it has those.
-    pub fn prepared<'a>(&'a self, network: &'a Network) -> Option<&'a dyn Prepared> {
+    /// How its weights are packed, if they are.
+    pub fn packing<'a>(&'a self, network: &'a Network) -> Option<&'a dyn Packing> {
         match &self.kind {
-            Kind::Layer => network.layers()[self.layers.start].layer.prepared(),
+            Kind::Layer => network.layers()[self.layers.start].layer.packing(),
             Kind::NormRectify(_) => None,
             Kind::PooledConv(fused) => Some(&**fused),
         }
@@ -143,18 +145,20 @@ pub(in crate::engine::network) fn replaces_input(network: &Network, stages: &[Fu
 
 /// The [`NormRectify`] that computes the first of `layers`, and how many of them it computes.
 fn norm_rectify(network: &Network, layers: &[NamedLayer]) -> Option<(usize, NormRectify)> {
-    let LayerSpec::BatchNorm { epsilon, running_old_weight } = layers.first()?.spec else { return None };
+    let LayerSpec::BatchNorm(BatchNormSpec { epsilon, running_old_weight }) = layers.first()?.spec else { return None };
     // The gradients of the slopes are computed at the barrier, and frozen batch norm has no barrier.
     if layers[0].frozen {
         return None;
     }
     let slopes = match layers.get(1)?.spec {
-        LayerSpec::Relu {} => None,
-        LayerSpec::PRelu { slopes, .. } => Some(slopes),
+        LayerSpec::Relu(_) => None,
+        LayerSpec::PRelu(PReluSpec { slopes, .. }) => Some(slopes),
         _ => return None,
     };
     let pooled = match layers.get(2).map(|layer| &layer.spec) {
-        Some(LayerSpec::MaxPool { window: [2, 2], stride }) => stride.is_none_or(|stride| stride == [2, 2]),
+        Some(LayerSpec::MaxPool(MaxPoolSpec { window: [2, 2], stride })) => {
+            stride.is_none_or(|stride| stride == [2, 2])
+        }
         _ => false,
     };
     let shape = layers[0].layer.input();
@@ -167,13 +171,15 @@ fn norm_rectify(network: &Network, layers: &[NamedLayer]) -> Option<(usize, Norm
 /// The [`PooledConv`] that computes the first three of `layers`, if they are such layers.
 fn pooled_conv(network: &Network, layers: &[NamedLayer]) -> Option<PooledConv> {
     let [conv, activation, pool, ..] = layers else { return None };
-    let LayerSpec::Conv2d { filters, kernel, stride, padding, init } = conv.spec else { return None };
+    let LayerSpec::Conv2d(Conv2dSpec { filters, kernel, stride, padding, init }) = conv.spec else { return None };
     let activation = match activation.spec {
-        LayerSpec::Relu {} => MonotonicActivation::Relu,
-        LayerSpec::Elu { alpha } => MonotonicActivation::Elu(alpha),
+        LayerSpec::Relu(_) => MonotonicActivation::Relu,
+        LayerSpec::Elu(EluSpec { alpha }) => MonotonicActivation::Elu(alpha),
         _ => return None,
     };
-    let LayerSpec::MaxPool { window: [4, 4], stride: None | Some([4, 4]) } = pool.spec else { return None };
+    let LayerSpec::MaxPool(MaxPoolSpec { window: [4, 4], stride: None | Some([4, 4]) }) = pool.spec else {
+        return None;
+    };
     let isa = network.isa();
     let conv = Conv2d::new(conv.layer.input(), filters, kernel, stride, padding, init, network.backend()).ok()?;
     PooledConv::new(conv, activation, isa)
