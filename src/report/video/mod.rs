@@ -6,6 +6,7 @@
 
 pub mod drive;
 pub mod file;
+mod mp4;
 pub mod pace;
 pub mod panel;
 pub mod recording;
