@@ -43,9 +43,45 @@ pub enum Error {
         /// What was expected and what was found.
         message: String,
     },
-    /// The request itself cannot be carried out as asked.
+    /// The user typed something that cannot be carried out: an argument, a name, or a key of a recipe.
     #[error("{0}")]
     Usage(String),
+    /// A function of the library was given a value that it does not take, such as an image of another shape.
+    #[error("{0}")]
+    Input(String),
+    /// A picture or a video could not be encoded or decoded.
+    #[error("{0}")]
+    Codec(String),
+    /// Training diverged: a loss or a weight is not finite any more.
+    #[error("{0}")]
+    Diverged(String),
+    /// Nothing can be written at this place: the disk is full, or the folder is read-only.
+    #[error("{path}: {source}; {remedy}", path = path.display())]
+    CannotWrite {
+        /// The file or folder.
+        path: PathBuf,
+        /// What the operating system said.
+        source: std::io::Error,
+        /// What the user can do.
+        remedy: String,
+    },
+    /// The server that this program connects to is gone, or does not reply.
+    #[error("{0}")]
+    Connection(String),
+    /// The operating system refused a port, a thread or a signal handler. The message has the remedy.
+    #[error("{0}")]
+    System(String),
+    /// This program is at fault.
+    #[error("{0}; this is a fault of steersman, please report it")]
+    Fault(String),
+    /// The work ended early, and part of its result is kept.
+    #[error("{cause}; {kept}")]
+    EndedEarly {
+        /// Why it ended.
+        cause: Box<Error>,
+        /// What is kept, where it is, and how to go on.
+        kept: String,
+    },
     /// The person at the keyboard pressed Ctrl-C.
     #[error("interrupted")]
     Interrupted,

@@ -6,8 +6,8 @@
 //! A frame's way to the wheels: [`dataset`] reads a recording, splits it *before* anything is augmented, decodes each image
 //! once and preprocesses it; a [`recipe`] says how, and what network to train; [`network`](engine::network) plans the buffers of its
 //! [`layers`](engine::layers) and runs them; [`training`] goes through the epochs, follows the gradient with an [`optimizer`](engine::optimizer) and writes the
-//! run folder; [`model_file`] is what remains; a [`pilot`] loads it and steers. [`report`] measures how well it predicts,
-//! and [`simulator`] how well it drives; [`live`] shows a drive in a browser, and lets a person drive there; [`exchange`] reads
+//! run folder; [`model_file`] is what remains; a [`pilot`] loads it and steers. [`metrics`] measure how well it predicts,
+//! and [`simulator`] how well it drives; [`report`] shows both on pages and in films; [`live`] shows a drive in a browser, and lets a person drive there; [`exchange`] reads
 //! models of other programs and writes ours down for them. [`cli`] is the command line.
 //!
 //! Dependencies point one way: `steersman-kernels` (all vector code and every `unsafe` line) ← [`tensor`](engine::tensor) ← [`layers`](engine::layers) ←
@@ -158,8 +158,10 @@ pub mod exchange;
 pub mod files;
 pub mod live;
 pub mod main_job;
+pub mod metrics;
 pub mod model_file;
 mod net;
+pub mod picture;
 pub mod pilot;
 pub mod recipe;
 pub mod report;

@@ -5,11 +5,14 @@ use std::sync::Arc;
 
 use steersman_kernels::Isa;
 
-use crate::dataset::decode::{MAX_SIDE, RgbImage, decode_rgb_within};
 use crate::dataset::preprocess::Preprocessor;
 use crate::engine::network::{InferencePlan, Network, ObservationPlan, Parameters};
 use crate::error::{Error, Result};
 use crate::model_file::Model;
+use crate::picture::{
+    RgbImage,
+    decode::{MAX_SIDE, decode_rgb_within},
+};
 use crate::recipe::Recipe;
 use crate::simulator::{DriveState, Driver, HEIGHT, RgbFrame, WIDTH};
 
@@ -106,7 +109,7 @@ impl Pilot {
     ///
     /// # Errors
     ///
-    /// [`Error::Usage`] if the image has no pixels, or not as many as it says.
+    /// [`Error::Input`] if the image has no pixels, or not as many as it says.
     pub fn steer(&mut self, height: usize, width: usize, rgb: &[u8]) -> Result<f32> {
         self.look_at(height, width, rgb)?;
         let mut steering = [0.0];
@@ -137,7 +140,7 @@ impl Pilot {
     /// Makes the network's input of an RGB image.
     fn look_at(&mut self, height: usize, width: usize, rgb: &[u8]) -> Result<()> {
         if rgb.len() != height * width * 3 {
-            return Err(Error::Usage(format!("{} bytes are no RGB image of {width}x{height} pixels", rgb.len())));
+            return Err(Error::Input(format!("{} bytes are no RGB image of {width}x{height} pixels", rgb.len())));
         }
         if self.preprocessor.image_size() != [height, width] {
             self.preprocessor = self.model.recipe.preprocessing.plan(height, width)?;
@@ -151,7 +154,7 @@ impl Pilot {
     ///
     /// # Errors
     ///
-    /// [`Error::Usage`] that says what is wrong with the image.
+    /// [`Error::Codec`] that says what is wrong with the image.
     pub fn steer_encoded(&mut self, bytes: &[u8]) -> Result<f32> {
         self.steer_encoded_within(bytes, MAX_SIDE)
     }
@@ -165,7 +168,7 @@ impl Pilot {
         let mut image = std::mem::take(&mut self.image);
         let steering = match decode_rgb_within(bytes, max_side, &mut image) {
             Ok(()) => self.steer(image.height, image.width, &image.pixels),
-            Err(message) => Err(Error::Usage(message)),
+            Err(message) => Err(Error::Codec(message)),
         };
         self.image = image;
         steering
@@ -179,7 +182,7 @@ impl Pilot {
     pub fn steer_file(&mut self, path: &Path) -> Result<f32> {
         let bytes = std::fs::read(path).map_err(Error::io(path))?;
         self.steer_encoded(&bytes).map_err(|e| match e {
-            Error::Usage(message) => Error::data(path, message),
+            Error::Codec(message) | Error::Input(message) => Error::data(path, message),
             other => other,
         })
     }

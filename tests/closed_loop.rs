@@ -13,8 +13,7 @@ use steersman::main_job::training_set::{Take, recordings};
 use steersman::main_job::{TrackResult, test_on_track};
 use steersman::pilot::Pilot;
 use steersman::recipe::Recipe;
-use steersman::simulator::trial::drive;
-use steersman::simulator::{DriveOptions, Driver, Track, Zero};
+use steersman::simulator::{DriveOptions, Driver, Track, Zero, drive};
 use steersman::training::{EpochRecord, Observer, TrainRequest, TrainResult, train};
 
 struct Silent;

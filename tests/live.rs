@@ -12,7 +12,7 @@ use common::page::{Page, serve};
 use common::served::{Served, random_model};
 use serde_json::{Value, json};
 use steersman::dataset;
-use steersman::dataset::decode::{RgbImage, decode_rgb};
+use steersman::picture::{RgbImage, decode::decode_rgb};
 
 /// Starts driving by hand in `folder`, recording into `rec`.
 fn by_hand(folder: &Path, args: &[&str]) -> Served {

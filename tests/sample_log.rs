@@ -5,7 +5,7 @@
 use std::fs;
 use std::path::Path;
 
-use steersman::dataset::decode::{RgbImage, decode_rgb};
+use steersman::picture::{RgbImage, decode::decode_rgb};
 use steersman::simulator::{RecordOptions, Track, record};
 
 /// Every ninth frame of a 10 Hz drive: neighbours stay within the second that makes them one session.

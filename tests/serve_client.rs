@@ -9,7 +9,7 @@ use common::double::{Peer, start};
 use data_encoding::BASE64;
 use serde_json::Value;
 use steersman::Error;
-use steersman::dataset::decode::{RgbImage, decode_rgb};
+use steersman::picture::{RgbImage, decode::decode_rgb};
 use steersman::serve::client::{ClientOptions, ClientReport, Numbers, Observer, Pace, drive};
 use steersman::serve::protocol::DecimalMark;
 use steersman::simulator::car::speed::SpeedController;

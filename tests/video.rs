@@ -9,7 +9,7 @@ use std::process::{Command, Stdio};
 
 use common::command::{error, json, run, steersman};
 use common::{mp4, painted_log};
-use steersman::dataset::decode::RgbImage;
+use steersman::picture::RgbImage;
 use steersman::report::video::file::VideoFile;
 
 /// Pictures, seconds, width and height of a video.

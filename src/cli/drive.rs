@@ -15,10 +15,10 @@ use crate::files::new_folder::NewFolder;
 use crate::live::messages::Hello;
 use crate::live::{DEFAULT_PORT, Live, Watch};
 use crate::pilot::Pilot;
-use crate::report::map;
-use crate::report::video::Onlooker;
+use crate::report::charts::map;
 use crate::report::video::drive::DriveVideo;
-use crate::report::video::panel::Names;
+use crate::report::video::onlooker::Onlooker;
+use crate::report::video::painter::Captions;
 use crate::simulator::trial::drive::drive;
 use crate::simulator::trial::drive::write_trajectories;
 use crate::simulator::trial::statistics::PairedTest;
@@ -201,7 +201,7 @@ impl Wheel {
             }
             _ => None,
         };
-        let names = Names {
+        let names = Captions {
             title: format!("{}, seed {}", track.name(), args.seed),
             subtitle: args.model.clone(),
             model: Some(if matches!(self, Wheel::Model(_)) { "model" } else { "driver" }),

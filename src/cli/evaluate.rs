@@ -12,9 +12,9 @@ use super::{or_dash, pool, print_json};
 use crate::dataset::held_out::trained_on_held_out;
 use crate::dataset::{self, Camera, Recording};
 use crate::error::{Error, Result};
+use crate::metrics::{Metrics, Prediction};
 use crate::model_file::Model;
 use crate::pilot::Pilot;
-use crate::report::{Metrics, Prediction};
 
 /// Compare a model's steering with what was recorded: centre camera, every usable row
 #[derive(Debug, Args)]
@@ -60,8 +60,9 @@ pub fn run(args: EvaluateArgs) -> Result<()> {
         predictions.extend(pool.install(|| predict(&pilot, &recording, sessions_before)));
         sessions_before += recording.sessions.len();
     }
-    let metrics = Metrics::of(&predictions, full_lock_deg).ok_or_else(|| {
-        Error::Usage("these recordings have no row that can be used; `steersman inspect` says why".into())
+    let metrics = Metrics::of(&predictions, full_lock_deg).ok_or_else(|| Error::Data {
+        place: "the recordings".into(),
+        message: "no row can be used; `steersman inspect` says why".into(),
     })?;
     if known > 0 {
         eprintln!(

@@ -9,7 +9,7 @@ use super::{RecipeArgs, new_folder, pool, print, print_json, refuse_existing};
 use crate::dataset::inspect::inspect;
 use crate::error::Result;
 use crate::files::atomic_file;
-use crate::report::inspection;
+use crate::report::pages::inspection;
 
 /// Say what is in a recording: rows, sessions, labels, pictures, what cannot be used, and what to do about it
 #[derive(Debug, Args)]

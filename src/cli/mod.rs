@@ -126,7 +126,9 @@ impl RecipeArgs {
 /// A rayon pool of `threads` (0: one for each core).
 fn pool(threads: usize) -> Result<rayon::ThreadPool> {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
-    pool.map_err(|e| Error::Usage(format!("cannot start {threads} threads: {e}; give a smaller number with --threads")))
+    pool.map_err(|e| {
+        Error::System(format!("cannot start {threads} threads: {e}; give a smaller number with --threads"))
+    })
 }
 
 /// A flag that Ctrl-C sets; the second Ctrl-C ends the process at once.
@@ -138,7 +140,7 @@ fn stop_on_ctrl_c() -> Result<Arc<AtomicBool>> {
             std::process::exit(130);
         }
     };
-    ctrlc::set_handler(handler).map_err(|e| Error::Usage(format!("cannot listen for Ctrl-C: {e}")))?;
+    ctrlc::set_handler(handler).map_err(|e| Error::System(format!("cannot listen for Ctrl-C: {e}")))?;
     Ok(stop)
 }
 
@@ -166,7 +168,7 @@ fn print(text: &str) -> Result<()> {
 
 /// Prints one JSON value as the last line.
 fn print_json(value: &impl Serialize) -> Result<()> {
-    let text = serde_json::to_string(value).map_err(|e| Error::Usage(format!("cannot be written as JSON: {e}")))?;
+    let text = serde_json::to_string(value).map_err(|e| Error::Fault(format!("cannot be written as JSON: {e}")))?;
     print(&(text + "\n"))
 }
 

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::or_dash;
-use crate::report::sparkline::sparkline;
+use crate::report::charts::sparkline::sparkline;
 use crate::training::{EpochRecord, Observer};
 
 /// Time between plain progress lines.

@@ -146,7 +146,7 @@ pub fn run(args: TrainArgs) -> Result<()> {
 
 /// Writes the page of the finished run in `folder`. The run is saved; a page that cannot be written takes nothing from it.
 fn write_report(folder: &Path) {
-    match report::run::write(folder) {
+    match report::pages::run::write(folder) {
         Ok(page) => eprintln!("report {}", page.display()),
         Err(error) => eprintln!("note: no report.html: {error}"),
     }

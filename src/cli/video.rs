@@ -10,8 +10,10 @@ use super::share_bar::ShareBar;
 use super::{print_json, stop_on_ctrl_c};
 use crate::error::{Error, Result};
 use crate::pilot::Pilot;
-use crate::report::video::replay::{self, Choice};
-use crate::report::video::{Onlooker, VideoSummary, recording};
+use crate::report::video::onlooker::Onlooker;
+use crate::report::video::recording;
+use crate::report::video::replay::{self, RunChoice};
+use crate::report::video::summary::VideoSummary;
 use crate::simulator::trial::trajectory::{RUN_DEPTH, find_drives, is_drive};
 
 /// Write a recording or a saved drive as a video that browsers and VLC play
@@ -72,7 +74,7 @@ pub fn run(args: VideoArgs) -> Result<()> {
         !stop.load(Ordering::Relaxed)
     };
     let (summary, stopped) = if is_drive {
-        let choice = Choice { seed: args.seed, assisted: args.assisted };
+        let choice = RunChoice { seed: args.seed, assisted: args.assisted };
         replay::film(&args.source, choice, &args.file, onlooker, args.fps, &mut progress)?
     } else {
         recording::film(&args.source, &args.file, onlooker, args.fps, &mut progress)?

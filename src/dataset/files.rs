@@ -1,7 +1,7 @@
 //! The image files of a recording: finding them, checking them, and remembering them in few bytes.
 
-use super::decode::{ends_complete, starts_as_image};
 use super::recording::Reason;
+use crate::picture::decode::{ends_complete, starts_as_image};
 use std::collections::HashMap;
 use std::ffi::OsString;
 use std::fs::File;

@@ -1,6 +1,5 @@
 //! Finding out what a recording is, and reading it.
 
-use super::decode;
 use super::driving_log::{Entry, Line, Log, time_of};
 use super::files::{Files, Locator, split_path};
 use super::recording::{Camera, Kind, Reason, Recording, Row, Unusable, file_name};
@@ -247,7 +246,7 @@ impl Builder {
         recording.image_size = recording
             .image_path(0, Camera::Centre)
             .and_then(|path| fs::read(path).ok())
-            .and_then(|bytes| decode::image_size(&bytes).ok());
+            .and_then(|bytes| crate::picture::decode::image_size(&bytes).ok());
         Ok(recording)
     }
 }

@@ -6,7 +6,6 @@
 
 use super::augment::Augmentation;
 use super::cache::{CacheSpec, ImageCache};
-use super::decode::{RgbImage, decode_rgb};
 use super::leak::{NearTwins, Thumbnail};
 use super::preprocess::{Preprocessing, Preprocessor};
 use super::recording::{Camera, Recording};
@@ -14,6 +13,7 @@ use super::samples::{Flip, Group, Item, SampleSpec};
 use super::split::Split;
 use crate::engine::random::{Purpose, rng, shuffle, unit};
 use crate::engine::stopwatch::Stopwatch;
+use crate::picture::{RgbImage, decode::decode_rgb};
 use crate::{Error, Result};
 use rayon::prelude::*;
 use std::collections::BTreeMap;

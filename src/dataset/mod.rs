@@ -14,7 +14,6 @@ pub mod augment;
 pub mod cache;
 pub mod colour;
 mod decimal_comma;
-pub mod decode;
 mod driving_log;
 mod files;
 pub mod held_out;

@@ -121,7 +121,7 @@ impl Preprocessing {
     pub fn plan(&self, height: usize, width: usize) -> Result<Preprocessor> {
         self.validate()?;
         if [height, width].iter().any(|n| !(1..=MAX_SIDE).contains(n)) {
-            return Err(Error::Usage(format!("cannot preprocess an image of {width}x{height} pixels")));
+            return Err(Error::Input(format!("cannot preprocess an image of {width}x{height} pixels")));
         }
         let from = [height, width];
         let to_source = (from != self.source).then(|| {

@@ -2,6 +2,8 @@
 
 use super::files::{Files, Name};
 use super::preprocess::Preprocessing;
+use crate::picture::RgbImage;
+use crate::picture::decode::decode_rgb;
 use crate::{Error, Result};
 use serde::Serialize;
 use sha2::{Digest, Sha256};
@@ -181,6 +183,14 @@ impl Recording {
     pub fn image_path(&self, row: usize, camera: Camera) -> Option<PathBuf> {
         let name = self.rows.get(row)?.images[camera as usize]?;
         Some(self.files.path(name))
+    }
+
+    /// The picture of `camera` at `row`, if there is one that can be read and decoded.
+    pub fn picture(&self, row: usize, camera: Camera) -> Option<RgbImage> {
+        let bytes = std::fs::read(self.image_path(row, camera)?).ok()?;
+        let mut image = RgbImage::default();
+        decode_rgb(&bytes, &mut image).ok()?;
+        Some(image)
     }
 
     /// A number that stands for `row` wherever the recording lies: from the name of its centre image and its steering. Model

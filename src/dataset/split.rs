@@ -186,14 +186,14 @@ impl Split {
 
     fn require_both_sides(&self) -> Result<()> {
         if self.training.is_empty() {
-            return Err(Error::Usage("no training rows are left: record more, or leave out less".into()));
+            let message = "no training rows are left: record more, or leave out less".into();
+            return Err(Error::Data { place: "the recordings".into(), message });
         }
         if self.validation.is_empty() && self.spec.validation_share > 0.0 {
-            return Err(Error::Usage(
-                "no validation rows: no session is longer than 10 s. Record a longer drive, set validation_share = 0, \
-                 or use the (leaking) split mode `random`"
-                    .into(),
-            ));
+            let message = "no validation rows: no session is longer than 10 s. Record a longer drive, set \
+                           validation_share = 0, or use the (leaking) split mode `random`"
+                .into();
+            return Err(Error::Data { place: "the recordings".into(), message });
         }
         Ok(())
     }

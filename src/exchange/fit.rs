@@ -10,14 +10,14 @@ use std::path::Path;
 use rayon::prelude::*;
 
 use crate::dataset::colour::Colour;
-use crate::dataset::decode::{RgbImage, decode_rgb};
 use crate::dataset::preprocess::Preprocessing;
 use crate::dataset::resize::Interpolation;
 use crate::dataset::{Camera, Recording};
 use crate::engine::network::{InferencePlan, LayerSpec, Network, Parameters};
 use crate::engine::tensor::Shape;
 use crate::error::{Error, Result};
-use crate::report::correlation;
+use crate::metrics::correlation;
+use crate::picture::{RgbImage, decode::decode_rgb};
 
 /// Kept rows of Udacity's picture, in projects of the field.
 const CROPS: [[usize; 2]; 12] = [

@@ -40,7 +40,7 @@ impl NewFile {
     ///
     /// # Errors
     ///
-    /// [`Error::Usage`] if there is something at `path`, or nothing can be created there.
+    /// [`Error::Usage`] if there is something at `path`, [`Error::CannotWrite`] if nothing can be created there.
     pub fn create(path: &Path) -> Result<NewFile> {
         if fs::symlink_metadata(path).is_ok() {
             return Err(exists(path, "file"));

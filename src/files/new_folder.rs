@@ -21,7 +21,7 @@ impl NewFolder {
     ///
     /// # Errors
     ///
-    /// [`Error::Usage`] if there is something at `path`, or nothing can be created there.
+    /// [`Error::Usage`] if there is something at `path`, [`Error::CannotWrite`] if nothing can be created there.
     pub fn create(path: &Path) -> Result<NewFolder> {
         if fs::symlink_metadata(path).is_ok() {
             return Err(exists(path, "folder"));
@@ -89,7 +89,7 @@ pub(crate) fn explain_full_disk(path: &Path, out: &Path, source: io::Error, kind
     if full.contains(&source.kind()) {
         let remedy =
             format!("nothing of {} is kept; make room on that disk, or name a {kind} on another", out.display());
-        return Error::Usage(format!("{}: {source}; {remedy}", path.display()));
+        return Error::CannotWrite { path: path.into(), source, remedy };
     }
     Error::io(path)(source)
 }
@@ -118,8 +118,9 @@ pub(crate) fn create_parent(path: &Path) -> Result<&Path> {
 }
 
 pub(crate) fn denied(path: &Path, source: &io::Error) -> Error {
-    let message = format!("cannot be created: {source}; name a folder where you may write");
-    Error::Usage(format!("{}: {message}", path.display()))
+    let remedy = "name a folder where you may write".into();
+    let source = io::Error::new(source.kind(), format!("cannot be created: {source}"));
+    Error::CannotWrite { path: path.into(), source, remedy }
 }
 
 /// The error of a `kind` ("file" or "folder") that would have to replace something.

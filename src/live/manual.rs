@@ -22,7 +22,7 @@ use crate::simulator::recorder::writer::RowWriter;
 use crate::simulator::{RecordOptions, Simulation, Start, Track};
 
 /// What is said where the program itself is at fault.
-const FAULT: &str = "the recording ended early by a fault of this program";
+const FAULT: &str = "the recording ended early";
 
 /// Steps between frames: 25 frames a second.
 const STEPS_PER_FRAME: u64 = 2;
@@ -91,7 +91,7 @@ impl<'a> ManualDrive<'a> {
                 std::thread::sleep(clock.until(steps as f64 * STEP_S, Instant::now()));
                 // A fault here must not take with it what was recorded, nor leave the writer waiting.
                 let step = catch_unwind(AssertUnwindSafe(|| session.step()));
-                drive = step.unwrap_or_else(|_| Err(Error::Usage(FAULT.into())));
+                drive = step.unwrap_or_else(|_| Err(Error::Fault(FAULT.into())));
                 steps += 1;
             }
             session.samples = None;
@@ -101,7 +101,7 @@ impl<'a> ManualDrive<'a> {
             (drive, writing.join())
         });
         let (rows, trouble) = written.unwrap_or_else(|_| {
-            (session.coverage.shares(options.hz, track.length_m).rows, Some(Error::Usage(FAULT.into())))
+            (session.coverage.shares(options.hz, track.length_m).rows, Some(Error::Fault(FAULT.into())))
         });
         let trouble = drive.err().or(trouble);
         let advice = session.coverage.advice(track.length_m);
@@ -130,9 +130,10 @@ impl<'a> ManualDrive<'a> {
             None => format!("nothing was recorded, so there is no {}", out.display()),
         };
         if let Some(trouble) = trouble {
-            let message = format!("{trouble}; {words}; look after the disk before you go on with a new folder");
-            live.finish(&format!("The drive ended early: {message}."));
-            return Err(Error::Usage(message));
+            let kept = format!("{words}; look after the disk before you go on with a new folder");
+            let error = Error::EndedEarly { cause: Box::new(trouble), kept };
+            live.finish(&format!("The drive ended early: {error}."));
+            return Err(error);
         }
         live.finish(&format!("The drive is over: {words}."));
         Ok(ManualSummary { info, folder, coverage, advice })

@@ -6,8 +6,8 @@
 use serde::{Deserialize, Serialize};
 
 use super::coverage::Shares;
-use crate::report::map;
-use crate::report::palette::heat_hex;
+use crate::report::charts::map;
+use crate::report::charts::palette::heat_hex;
 use crate::simulator::car::dynamics::MAX_STEER_DEG;
 use crate::simulator::car::expert::pursuit;
 use crate::simulator::car::speed::telemetry_mph;

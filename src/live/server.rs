@@ -59,11 +59,11 @@ impl Live {
     ///
     /// # Errors
     ///
-    /// [`Error::Usage`] with the remedy if the port cannot be had.
+    /// [`Error::System`] with the remedy if the port cannot be had.
     pub fn start(port: u16, hello: Hello, by_hand: bool) -> Result<Live> {
         let in_use = "end it, or give another --port; 0 takes any free one";
         let listener = http::listen(SocketAddr::from((Ipv4Addr::LOCALHOST, port)), in_use)?;
-        let fault = |e: std::io::Error| Error::Usage(format!("cannot serve the page: {e}"));
+        let fault = |e: std::io::Error| Error::System(format!("cannot serve the page: {e}"));
         let address = listener.local_addr().map_err(fault)?;
         let hub = Arc::new(Hub::new(hello, by_hand));
         let shared = hub.clone();

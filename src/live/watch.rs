@@ -6,10 +6,10 @@ use std::time::{Duration, Instant};
 use super::clock::Clock;
 use super::messages::State;
 use super::server::Live;
-use crate::dataset::decode::RgbImage;
 use crate::error::{Error, Result};
+use crate::picture::RgbImage;
 use crate::pilot::Pilot;
-use crate::report::saliency::Saliency;
+use crate::report::explain::saliency::Saliency;
 use crate::simulator::camera::jpeg;
 use crate::simulator::{DriveFrame, DriveObserver, HEIGHT, RunOptions, WIDTH};
 

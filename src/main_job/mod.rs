@@ -12,7 +12,7 @@ use serde::Serialize;
 use crate::error::{Error, Result};
 use crate::files::new_folder::NewFolder;
 use crate::pilot::Pilot;
-use crate::report::map;
+use crate::report::charts::map;
 use crate::simulator::camera::eye::Eye;
 use crate::simulator::recorder::record::drive_expert;
 use crate::simulator::trial::drive::drive;
@@ -89,12 +89,15 @@ pub fn test_on_track(
 ///
 /// # Errors
 ///
-/// [`Error::Usage`] if a picture cannot be encoded.
+/// [`Error::Codec`] if a picture cannot be encoded.
 pub fn offline_mae_deg(pilot: &Pilot, track: &Track, seed: u64) -> Result<f64> {
     let samples = drive_expert(track, &RecordOptions { seed, ..Default::default() });
     let (mut pilot, mut eye) = (pilot.clone(), Eye::new(track, seed));
     if samples.is_empty() {
-        return Err(Error::Usage(format!("the expert makes no way on {}", track.name())));
+        return Err(Error::Data {
+            place: track.name().into(),
+            message: "the expert makes no way on this track".into(),
+        });
     }
     let mut sum = 0.0;
     let count = samples.len().min(OFFLINE_FRAMES);

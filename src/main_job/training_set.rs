@@ -90,7 +90,7 @@ fn settings(takes: &[Take]) -> Result<String> {
         tracks_hash: String,
         take: &'a [Take],
     }
-    let failed = |e: toml::ser::Error| Error::Usage(format!("the training set cannot be described: {e}"));
+    let failed = |e: toml::ser::Error| Error::Fault(format!("the training set cannot be described: {e}"));
     let mut tracks = Sha256::new();
     for of_track in takes.chunk_by(|a, b| a.track == b.track) {
         tracks.update(toml::to_string(&Track::load(&of_track[0].track)?.spec).map_err(failed)?);

@@ -115,7 +115,7 @@ pub(crate) fn response(status: &str, content_type: &str, headers: &str, body: &s
 ///
 /// # Errors
 ///
-/// [`Error::Usage`] with the remedy if the address cannot be had.
+/// [`Error::System`] with the remedy if the address cannot be had.
 pub(crate) fn listen(address: SocketAddr, in_use: &str) -> Result<TcpListener> {
     let listening = TcpListener::bind(address).and_then(|listener| {
         listener.set_nonblocking(true)?;
@@ -128,7 +128,7 @@ pub(crate) fn listen(address: SocketAddr, in_use: &str) -> Result<TcpListener> {
             ErrorKind::AddrNotAvailable => "give this machine's own address, or 0.0.0.0 for all",
             _ => "give another address or port",
         };
-        Error::Usage(format!("cannot listen at {address}: {error}; {remedy}"))
+        Error::System(format!("cannot listen at {address}: {error}; {remedy}"))
     })
 }
 

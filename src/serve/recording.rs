@@ -139,9 +139,7 @@ impl Recorder {
     pub fn finish(self) -> Result<Recorded> {
         let Recorder { folder, sender, writer, state } = self;
         drop(sender);
-        let rows = writer
-            .join()
-            .map_err(|_| Error::Usage("the recording ended early by a fault of this program".into()))??;
+        let rows = writer.join().map_err(|_| Error::Fault("the recording ended early".into()))??;
         let dropped = state.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner).dropped;
         if rows == 0 {
             remove_empty(&folder)?;

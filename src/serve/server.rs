@@ -167,7 +167,7 @@ impl Server {
     ///
     /// # Errors
     ///
-    /// [`Error::Usage`] with the remedy if the address cannot be had or the folder exists.
+    /// [`Error::System`] with the remedy if the address cannot be had, [`Error::Usage`] if the folder exists.
     pub fn bind(options: ServerOptions) -> Result<Server> {
         let address = options.address;
         let in_use = "end it (is drive.py still running?) or give --port";
@@ -180,9 +180,9 @@ impl Server {
     ///
     /// # Errors
     ///
-    /// [`Error::Usage`] if the system does not know it.
+    /// [`Error::System`] if the system does not know it.
     pub fn address(&self) -> Result<SocketAddr> {
-        self.listener.local_addr().map_err(|e| Error::Usage(format!("cannot tell the address: {e}")))
+        self.listener.local_addr().map_err(|e| Error::System(format!("cannot tell the address: {e}")))
     }
 
     /// Serves until `stop` is set. The driven car then gets its throttle cut.

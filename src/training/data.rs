@@ -29,7 +29,7 @@ impl Data {
     ///
     /// # Errors
     ///
-    /// [`Error::Io`] and [`Error::Data`] for recordings that cannot be used, [`Error::Usage`] if a side would be empty.
+    /// [`Error::Io`] and [`Error::Data`] for recordings that cannot be used, or if a side would be empty.
     pub fn prepare(paths: &[PathBuf], recipe: &Recipe, seed: u64, cache_mib: usize) -> Result<Data> {
         let mut recordings = Vec::new();
         let mut notices = Vec::new();

@@ -10,7 +10,7 @@
 //! | `model.safetensors` | the best model, by validation loss |
 //! | `last.safetensors` | the model of the last epoch; with early stopping, in the end the best one |
 //! | `checkpoint.safetensors` | where the run stands |
-//! | `report.html` | the run in pictures; see [`crate::report::run`] |
+//! | `report.html` | the run in pictures; see [`crate::report::pages::run`] |
 //! | `result.json` | what `train --json` prints; its presence says that the run is finished |
 
 mod checkpoint;

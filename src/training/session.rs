@@ -273,7 +273,10 @@ impl Session {
             self.train_epoch(&mut batches, observer, stop, seconds_before)?;
             if self.state.progress.images == 0 {
                 let examples = self.training.undecodable().1.join("; ");
-                return Err(Error::Usage(format!("no training image can be decoded: {examples}")));
+                return Err(Error::Data {
+                    place: "the recordings".into(),
+                    message: format!("no training image can be decoded: {examples}"),
+                });
             }
             let validation = match &mut self.validation {
                 Some(validation) => validation.run(&self.network, &self.state.parameters)?,
@@ -356,7 +359,7 @@ impl Session {
     }
 
     fn diverged(&self, what: &str) -> Error {
-        Error::Usage(format!(
+        Error::Diverged(format!(
             "training diverged in epoch {}: {what}. Try a smaller learning rate, as in --set optimizer.learning_rate={:e}",
             self.state.progress.epoch + 1,
             self.recipe.optimizer.learning_rate() / 10.0

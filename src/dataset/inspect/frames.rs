@@ -5,8 +5,8 @@ use std::hash::{DefaultHasher, Hash, Hasher};
 
 use rayon::prelude::*;
 
-use super::super::decode::{RgbImage, decode_rgb};
 use super::super::recording::{Camera, Recording};
+use crate::picture::{RgbImage, decode::decode_rgb};
 
 /// Rows that a thread looks at in one go.
 const CHUNK: usize = 128;

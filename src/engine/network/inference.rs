@@ -196,11 +196,11 @@ impl Network {
     ///
     /// # Errors
     ///
-    /// [`Error::Usage`] if the images have another shape than the network's input.
+    /// [`Error::Input`] if the images have another shape than the network's input.
     pub fn predict(&self, parameters: &Parameters, images: ArrayView4<f32>) -> Result<Array2<f32>> {
         let (n, c, h, w) = images.dim();
         if Shape::new(c, h, w) != self.input() {
-            return Err(Error::Usage(format!(
+            return Err(Error::Input(format!(
                 "the network takes images of {}, not of {}",
                 self.input(),
                 Shape::new(c, h, w)

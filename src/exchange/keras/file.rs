@@ -11,7 +11,8 @@ use serde::Deserialize;
 
 use super::architecture::KerasLayer;
 use super::hdf5::{self, Attribute, Dataset, Group};
-use super::{MAX_JSON_BYTES, shown, shown_list};
+use super::limits::MAX_JSON_BYTES;
+use super::messages::{shown, shown_list};
 use crate::error::{Error, Result};
 use crate::files::zip_archive::ZipArchive;
 

@@ -2,10 +2,12 @@
 
 use std::path::Path;
 
-use super::panel::{Names, Panel, Scene};
-use super::{Onlooker, Video, VideoSummary};
-use crate::dataset::decode::RgbImage;
+use super::film::Video;
+use super::onlooker::Onlooker;
+use super::painter::{Captions, FilmFrame, Painter};
+use super::summary::VideoSummary;
 use crate::error::{Error, Result};
+use crate::picture::RgbImage;
 use crate::simulator::car::dynamics::MAX_STEER_DEG;
 use crate::simulator::trial::run::{DRIVE_HZ, Failure};
 use crate::simulator::{DriveFrame, DriveObserver, Driver, HEIGHT, Run, RunOptions, Track, WIDTH, run_observed};
@@ -13,13 +15,13 @@ use crate::simulator::{DriveFrame, DriveObserver, Driver, HEIGHT, Run, RunOption
 /// A video of a run that is yet to be driven.
 pub struct DriveVideo {
     video: Video,
-    scene: Scene,
+    frame: FilmFrame,
     /// Colours the picture, if that was asked for; steers nothing.
     onlooker: Option<Onlooker>,
 }
 
 /// Films while the run goes on.
-struct Filming<'a> {
+struct FilmObserver<'a> {
     film: &'a mut DriveVideo,
     /// Whether the driver looks at pictures, so that its time to answer means something.
     looks: bool,
@@ -36,13 +38,13 @@ impl DriveVideo {
     pub fn create(
         path: &Path,
         track: &Track,
-        names: Names,
+        names: Captions,
         fps: Option<f64>,
         onlooker: Option<Onlooker>,
     ) -> Result<DriveVideo> {
-        let video = Video::create(path, Panel::new(names, Some(track)), fps.unwrap_or(DRIVE_HZ as f64))?;
-        let scene = Scene { picture: RgbImage::filled(HEIGHT, WIDTH, [0; 3]), ..Scene::default() };
-        Ok(DriveVideo { video, scene, onlooker })
+        let video = Video::create(path, Painter::new(names, Some(track)), fps.unwrap_or(DRIVE_HZ as f64))?;
+        let frame = FilmFrame { picture: RgbImage::filled(HEIGHT, WIDTH, [0; 3]), ..FilmFrame::default() };
+        Ok(DriveVideo { video, frame, onlooker })
     }
 
     /// Drives the run `seed`, as [`run`](crate::simulator::trial::run::run) does and to the same bits, and writes the video. `progress`
@@ -61,7 +63,7 @@ impl DriveVideo {
         progress: &mut dyn FnMut(f64) -> bool,
     ) -> Result<(VideoSummary, bool)> {
         let looks = driver.needs_frame();
-        match run_observed(track, driver, options, seed, &mut Filming { film: &mut self, looks, progress }) {
+        match run_observed(track, driver, options, seed, &mut FilmObserver { film: &mut self, looks, progress }) {
             Ok(run) => Ok((self.video.finish(&outcome(&run, options))?, false)),
             Err(Error::Interrupted) => Ok((self.video.finish("stopped")?, true)),
             Err(error) => Err(error),
@@ -69,25 +71,25 @@ impl DriveVideo {
     }
 }
 
-impl DriveObserver for Filming<'_> {
-    fn frame(&mut self, frame: &DriveFrame) -> Result<()> {
-        let DriveVideo { video, scene, onlooker } = &mut *self.film;
-        let simulation = frame.simulation;
-        scene.picture.pixels.clone_from(&frame.picture.pixels);
+impl DriveObserver for FilmObserver<'_> {
+    fn frame(&mut self, driven: &DriveFrame) -> Result<()> {
+        let DriveVideo { video, frame, onlooker } = &mut *self.film;
+        let simulation = driven.simulation;
+        frame.picture.pixels.clone_from(&driven.picture.pixels);
         if let Some(onlooker) = onlooker {
-            onlooker.look(&mut scene.picture)?;
+            onlooker.look(&mut frame.picture)?;
         }
-        scene.time_s = simulation.time_s();
-        scene.model_deg = Some(frame.steering * MAX_STEER_DEG);
-        scene.reference_deg = Some(frame.expert_steering * MAX_STEER_DEG);
-        scene.speed_mph = Some(frame.speed_mph);
-        scene.cte_m = Some(simulation.cte_m());
-        scene.answered_in = self.looks.then_some(frame.answered_in);
-        scene.lap = Some((frame.lap(), Some(frame.options.laps)));
-        scene.place = Some([simulation.car.x, simulation.car.y]);
-        scene.put_back = frame.put_back;
-        video.show(scene)?;
-        let way_m = frame.options.laps as f64 * simulation.track.length_m;
+        frame.time_s = simulation.time_s();
+        frame.model_deg = Some(driven.steering * MAX_STEER_DEG);
+        frame.reference_deg = Some(driven.expert_steering * MAX_STEER_DEG);
+        frame.speed_mph = Some(driven.speed_mph);
+        frame.cte_m = Some(simulation.cte_m());
+        frame.answered_in = self.looks.then_some(driven.answered_in);
+        frame.lap = Some((driven.lap(), Some(driven.options.laps)));
+        frame.place = Some([simulation.car.x, simulation.car.y]);
+        frame.put_back = driven.put_back;
+        video.show(frame)?;
+        let way_m = driven.options.laps as f64 * simulation.track.length_m;
         match (self.progress)((simulation.progress_m / way_m).clamp(0.0, 1.0)) {
             true => Ok(()),
             false => Err(Error::Interrupted),

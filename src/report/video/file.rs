@@ -7,11 +7,11 @@ use std::path::Path;
 use rusty_h264_common::{Profile, YuvPlanes};
 use rusty_h264_encoder::{Encoder, EncoderConfig, Preset};
 
-use super::VideoSummary;
 use super::mp4::{Mp4Writer, TICKS_PER_S, TrackHeader};
-use crate::dataset::decode::RgbImage;
+use super::summary::VideoSummary;
 use crate::error::{Error, Result};
 use crate::files::atomic_file::NewFile;
+use crate::picture::RgbImage;
 
 /// Seconds between pictures that stand alone, to which a player can jump.
 const KEY_S: f64 = 2.0;
@@ -55,7 +55,7 @@ impl VideoFile {
         config.framerate = fps as f32;
         config.gop_size = (KEY_S * fps).round().max(1.0) as u32;
         let encoder = Encoder::new(config)
-            .map_err(|e| Error::Usage(format!("pictures of {width}x{height} pixels make no video: {e}")))?;
+            .map_err(|e| Error::Codec(format!("pictures of {width}x{height} pixels make no video: {e}")))?;
         Ok(VideoFile {
             place: NewFile::create(path)?,
             muxer: None,
@@ -81,18 +81,18 @@ impl VideoFile {
     ///
     /// # Errors
     ///
-    /// [`Error::Usage`] if it has another size or the disk is full, [`Error::Io`] if the file cannot be written.
+    /// [`Error::Input`] if it has another size, [`Error::CannotWrite`] if the disk is full, [`Error::Io`] if the file cannot be written.
     pub fn write(&mut self, picture: &RgbImage) -> Result<()> {
         let [height, width] = self.size;
         if [picture.height, picture.width] != self.size {
             let (h, w) = (picture.height, picture.width);
-            return Err(Error::Usage(format!("a picture of {w}x{h} pixels in a video of {width}x{height}")));
+            return Err(Error::Input(format!("a picture of {w}x{h} pixels in a video of {width}x{height}")));
         }
         self.planes.take(picture);
         let unit = self
             .encoder
             .encode_planes(&self.planes.view(width, height))
-            .map_err(|e| Error::Usage(format!("picture {} cannot be encoded: {e}", self.frames)))?;
+            .map_err(|e| Error::Codec(format!("picture {} cannot be encoded: {e}", self.frames)))?;
         let unit = AccessUnit::parse(&unit);
         if self.muxer.is_none() {
             let header = TrackHeader {
@@ -115,11 +115,11 @@ impl VideoFile {
     ///
     /// # Errors
     ///
-    /// [`Error::Usage`] if there is no picture, something has come to be at the file's place, or the disk is full; [`Error::Io`]
-    /// if it cannot be written.
+    /// [`Error::Input`] if there is no picture, [`Error::Usage`] if another program has created the file, [`Error::CannotWrite`] if
+    /// the disk is full, [`Error::Io`] if it cannot be written.
     pub fn finish(mut self) -> Result<VideoSummary> {
         let Some(muxer) = self.muxer.take() else {
-            return Err(Error::Usage("a video without a picture is not written".into()));
+            return Err(Error::Input("a video without a picture is not written".into()));
         };
         muxer.finish().map_err(|e| self.place.explain(e))?;
         let (frames, fps) = (self.frames, self.fps());

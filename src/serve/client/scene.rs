@@ -360,7 +360,7 @@ impl<'a> Scene<'a> {
             return Ok(());
         }
         let Scene { options: ClientOptions { url, patience_s, .. }, trouble, .. } = self;
-        Err(Error::Usage(match (trouble.is_empty(), self.report.telemetries) {
+        Err(Error::Connection(match (trouble.is_empty(), self.report.telemetries) {
             (false, _) => {
                 format!("{url}: {trouble}, for {patience_s} s; start `steersman serve MODEL` and give its port")
             }

@@ -19,7 +19,7 @@ pub fn encode(frame: &RgbFrame, out: &mut Vec<u8>) -> Result<()> {
     encoder.set_sampling_factor(SamplingFactor::F_2_2);
     encoder
         .encode(&frame.pixels, WIDTH as u16, HEIGHT as u16, ColorType::Rgb)
-        .map_err(|e| Error::Usage(format!("a picture could not be encoded as JPEG: {e}")))
+        .map_err(|e| Error::Codec(format!("a picture could not be encoded as JPEG: {e}")))
 }
 
 /// Decodes a JPEG of 320x160 pixels into `frame`.
@@ -27,7 +27,7 @@ pub fn encode(frame: &RgbFrame, out: &mut Vec<u8>) -> Result<()> {
 /// # Errors
 /// If the bytes are no JPEG of that size.
 pub fn decode(bytes: &[u8], frame: &mut RgbFrame) -> Result<()> {
-    let fail = |e: &dyn std::fmt::Display| Error::Usage(format!("a JPEG could not be decoded: {e}"));
+    let fail = |e: &dyn std::fmt::Display| Error::Codec(format!("a JPEG could not be decoded: {e}"));
     frame.pixels.resize(WIDTH * HEIGHT * 3, 0);
     JpegDecoder::new(ZCursor::new(bytes)).decode_into(&mut frame.pixels).map_err(|e| fail(&e))
 }

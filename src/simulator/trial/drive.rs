@@ -285,7 +285,7 @@ fn summarise(track: &Track, options: &DriveOptions, runs: &[RunPair]) -> DriveSu
 pub fn compare(a: &DriveResult, b: &DriveResult) -> Result<Vec<PairedTest>> {
     let seeds = |d: &DriveResult| d.runs.iter().map(|r| r.seed).collect::<Vec<_>>();
     if a.summary.track != b.summary.track || seeds(a) != seeds(b) {
-        return Err(Error::Usage("only drives of one track with the same seeds can be compared".to_string()));
+        return Err(Error::Input("only drives of one track with the same seeds can be compared".to_string()));
     }
     let test = |measure: &str, f: &dyn Fn(&RunPair) -> f64| {
         let values = |d: &DriveResult| d.runs.iter().map(f).collect::<Vec<_>>();

@@ -4,10 +4,10 @@
 use rayon::prelude::*;
 use serde::Serialize;
 
-use super::footage::{Footage, Projector};
-use crate::dataset::decode::RgbImage;
 use crate::error::{Error, Result};
+use crate::picture::RgbImage;
 use crate::pilot::Pilot;
+use crate::report::explain::footage::{Footage, Projector};
 
 /// Where the horizon of Udacity's camera lies, as a share of the height.
 const HORIZON: f64 = 0.355;
@@ -212,14 +212,14 @@ pub struct Counterfactuals {
 ///
 /// # Errors
 ///
-/// As [`Footage::picture`]; [`Error::Usage`] if there is no picture.
+/// As [`Footage::picture`]; [`Error::Input`] if there is no picture.
 pub fn examine(
     pilot: &Pilot,
     footage: &Footage,
     progress: &(dyn Fn(f64) -> bool + Sync),
 ) -> Result<(Counterfactuals, Vec<f32>)> {
     if footage.is_empty() {
-        return Err(Error::Usage("there is no picture to look at".into()));
+        return Err(Error::Input("there is no picture to look at".into()));
     }
     let done = std::sync::atomic::AtomicUsize::new(0);
     let fresh = || (pilot.clone(), Projector::default(), RgbImage::default(), RgbImage::default());

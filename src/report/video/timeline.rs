@@ -2,24 +2,24 @@
 
 use std::path::Path;
 
-use super::VideoSummary;
 use super::file::VideoFile;
-use crate::dataset::decode::RgbImage;
+use super::summary::VideoSummary;
 use crate::error::Result;
+use crate::picture::RgbImage;
 
 /// A video whose picture at each moment is the last that came before it, to half a picture's time.
-pub(super) struct Pace {
+pub(super) struct Timeline {
     file: VideoFile,
     /// Painted and not yet written: how long it stays is known when the next one comes.
     picture: RgbImage,
     first_s: Option<f64>,
 }
 
-impl Pace {
+impl Timeline {
     /// As [`VideoFile::create`].
-    pub fn create(path: &Path, size: [usize; 2], fps: f64) -> Result<Pace> {
+    pub fn create(path: &Path, size: [usize; 2], fps: f64) -> Result<Timeline> {
         let picture = RgbImage::filled(size[0], size[1], [255; 3]);
-        Ok(Pace { file: VideoFile::create(path, size, fps)?, picture, first_s: None })
+        Ok(Timeline { file: VideoFile::create(path, size, fps)?, picture, first_s: None })
     }
 
     /// Whether nothing has been shown.
@@ -60,20 +60,21 @@ mod tests {
     /// Length in pictures of a video of 20 moments a second, written at `fps`, with a pause in it.
     fn pictures(fps: f64) -> u64 {
         let scratch = tempfile::tempdir().unwrap();
-        let mut pace = Pace::create(&scratch.path().join("a.mp4"), [32, 32], fps).unwrap();
-        assert!(pace.is_empty());
+        let mut timeline = Timeline::create(&scratch.path().join("a.mp4"), [32, 32], fps).unwrap();
+        assert!(timeline.is_empty());
         let mut painted = 0;
         for k in 0..40 {
             let pause_s = if k >= 20 { 0.65 } else { 0.0 };
-            pace.show(7.0 + f64::from(k) / 20.0 + pause_s, |picture| {
-                painted += 1;
-                *picture = RgbImage::filled(32, 32, [k as u8 * 6; 3]);
-            })
-            .unwrap();
+            timeline
+                .show(7.0 + f64::from(k) / 20.0 + pause_s, |picture| {
+                    painted += 1;
+                    *picture = RgbImage::filled(32, 32, [k as u8 * 6; 3]);
+                })
+                .unwrap();
         }
         assert_eq!(painted, 40);
-        pace.hold(1.0, |_| ()).unwrap();
-        pace.finish().unwrap().frames
+        timeline.hold(1.0, |_| ()).unwrap();
+        timeline.finish().unwrap().frames
     }
 
     #[test]

@@ -3,12 +3,12 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use super::chart::{Axis, Chart, Mark};
-use super::html::Page;
-use super::map::{self, Place};
-use super::palette;
 use crate::error::{Error, Result};
 use crate::recipe::Recipe;
+use crate::report::charts::chart::{Axis, Chart, Mark};
+use crate::report::charts::map::{self, MapPoint};
+use crate::report::charts::palette;
+use crate::report::pages::html::Page;
 use crate::simulator::trial::trajectory::{
     RUN_DEPTH, Waypoint, find_drives, read_summary, read_trajectory, trajectories,
 };
@@ -35,7 +35,7 @@ pub struct RunView {
 #[derive(Debug)]
 struct DriveView {
     summary: DriveSummary,
-    ways: Vec<Vec<Place>>,
+    ways: Vec<Vec<MapPoint>>,
 }
 
 /// Reads the runs in `folders`.
@@ -77,8 +77,8 @@ fn read_drive(folder: &Path) -> Result<DriveView> {
     Ok(DriveView { summary: read_summary(folder)?, ways })
 }
 
-fn read_way(path: &Path) -> Result<Vec<Place>> {
-    let place = |w: Waypoint| Place { x: w.x_m, y: w.y_m, cte_m: w.cte_m, put_back: w.intervention > 0 };
+fn read_way(path: &Path) -> Result<Vec<MapPoint>> {
+    let place = |w: Waypoint| MapPoint { x: w.x_m, y: w.y_m, cte_m: w.cte_m, put_back: w.intervention > 0 };
     Ok(read_trajectory(path)?.into_iter().map(place).collect())
 }
 
@@ -292,7 +292,7 @@ mod tests {
     #[test]
     fn runs_without_epochs_or_drives_have_a_page() {
         let text = page(&[run("a", &[]), run("b", &[])]).unwrap();
-        super::super::html::assert_stands_alone(&text);
+        crate::report::pages::html::assert_stands_alone(&text);
         assert!(text.contains("(unfinished)") && text.contains("No drives"));
     }
 }

@@ -6,12 +6,12 @@
 //! stride and padding of the layer between (weights 1, no bias; pooling likewise) and multiplied with the map there. The map
 //! that arrives at the input is scaled to [0, 1].
 //!
-//! It shows what *excites* the layers, not what the steering depends on: that is what [`super::counterfactual`] measures.
+//! It shows what *excites* the layers, not what the steering depends on: that is what [`crate::report::explain::counterfactual`] measures.
 
-use crate::dataset::decode::RgbImage;
 use crate::dataset::preprocess::Preprocessing;
 use crate::engine::network::{LayerSpec, Network};
 use crate::error::{Error, Result};
+use crate::picture::RgbImage;
 use crate::pilot::Pilot;
 
 /// Largest share of the overlay's colour.

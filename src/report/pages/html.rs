@@ -3,7 +3,7 @@
 
 use std::fmt::Write as _;
 
-use super::svg::{FONT, escape};
+use crate::report::charts::svg::{FONT, escape};
 
 const STYLE: &str = "
 body { margin: 0 auto; padding: 24px 32px 64px; max-width: 1136px; background: #fff; color: #1a1a1a; line-height: 1.5;

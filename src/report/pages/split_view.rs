@@ -1,13 +1,13 @@
 //! The split of recordings into training and validation, to be looked at.
 
-use super::html::Page;
-use super::palette::{BLUE, INK, ORANGE, PALE, QUIET_INK, VERMILION};
-use super::steering::driven_times;
-use super::svg::{Anchor, Svg};
 use crate::dataset::leak::LeakAudit;
 use crate::dataset::split::{GUARD_MS, Split};
 use crate::dataset::{Flip, Item, Recording};
 use crate::recipe::Recipe;
+use crate::report::charts::palette::{BLUE, INK, ORANGE, PALE, QUIET_INK, VERMILION};
+use crate::report::charts::steering::driven_times;
+use crate::report::charts::svg::{Anchor, Svg};
+use crate::report::pages::html::Page;
 
 /// Recordings drawn; the rest is counted.
 const MOST_STRIPS: usize = 24;
@@ -97,7 +97,7 @@ impl SplitView {
             };
             svg.rect([x, 10.0], [14.0, 14.0], &style);
             svg.text([x + 20.0, 22.0], 13.0, Anchor::Start, "", name);
-            x += 40.0 + super::svg::text_width(name, 13.0);
+            x += 40.0 + crate::report::charts::svg::text_width(name, 13.0);
         }
         let longest_s = self.strips.iter().map(|strip| strip.length_s).fold(1e-9, f64::max);
         let place = |s: f64| LEFT + s / longest_s * (WIDTH - LEFT - 20.0);

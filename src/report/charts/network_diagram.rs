@@ -1,9 +1,9 @@
 //! The diagram of a network: one block for each layer that changes the shape, with what is done to its output written below.
 
-use super::palette::{BLUE, GREEN, INK, ORANGE, PALE, QUIET_INK};
-use super::svg::{Anchor, Svg};
 use crate::engine::network::{LayerSpec, Network, group_digits};
 use crate::engine::tensor::Shape;
+use crate::report::charts::palette::{BLUE, GREEN, INK, ORANGE, PALE, QUIET_INK};
+use crate::report::charts::svg::{Anchor, Svg};
 
 /// Width of the drawing, pixels.
 const WIDTH: f64 = 1120.0;

@@ -1,14 +1,13 @@
-//! What a model looks at: pictures and the page of `explain`.
+//! The pictures of an explanation: saliency, filters, feature maps, and one picture in all its changes.
 
-use super::counterfactual::{Change, Counterfactuals};
+use super::counterfactual::Change;
 use super::footage::{Footage, Projector};
-use super::html::{Figure, Page};
-use super::picture::{HUMAN, MODEL, STEERING_SCALE};
 use super::saliency::Saliency;
-use crate::dataset::decode::RgbImage;
 use crate::engine::network::LayerSpec;
 use crate::error::Result;
+use crate::picture::RgbImage;
 use crate::pilot::Pilot;
+use crate::report::charts::steering_line::{HUMAN, MODEL, draw_steering};
 
 /// Pictures with saliency.
 const SALIENT: usize = 12;
@@ -64,10 +63,10 @@ pub fn exhibits(pilot: &Pilot, footage: &Footage, steering: &[f32]) -> Result<Ex
         saliency.overlay(&pilot.recipe().preprocessing, &mut picture);
         let mut caption = format!("{}\nmodel {:+.1}°", footage.name(i), degrees(answer));
         if let Some(label) = footage.label(i) {
-            picture.draw_steering(degrees(label), HUMAN);
+            draw_steering(&mut picture, degrees(label), HUMAN);
             caption += &format!(", label {:+.1}°", degrees(label));
         }
-        picture.draw_steering(degrees(answer), MODEL);
+        draw_steering(&mut picture, degrees(answer), MODEL);
         salient.push(Exhibit { name: format!("saliency_{:02}", k + 1), picture, caption });
     }
     // The hardest steering shows most.
@@ -176,73 +175,4 @@ fn sheet(tiles: &[RgbImage]) -> RgbImage {
         sheet.paste(tile, i / across * (first.height + GAP), i % across * (first.width + GAP));
     }
     sheet
-}
-
-/// The table of counterfactuals: a row for each change.
-pub fn table(found: &Counterfactuals) -> (Vec<&'static str>, Vec<Vec<String>>) {
-    let headers = vec!["change", "moves by", "95 % below", "to the right", "right way", "error", "", "what that means"];
-    let optional = |value: Option<f64>, text: fn(f64) -> String| value.map_or("-".into(), text);
-    let degrees = |value: f64| format!("{value:.2}°");
-    let mut rows = vec![vec![
-        "none".to_string(),
-        "-".into(),
-        "-".into(),
-        "-".into(),
-        "-".into(),
-        optional(found.mae_deg, degrees),
-        String::new(),
-        format!("it steers by {:.2}° on average", found.spread_deg),
-    ]];
-    rows.extend(found.effects.iter().map(|effect| {
-        vec![
-            effect.change.text().to_string(),
-            degrees(effect.mean_moved_deg),
-            degrees(effect.p95_moved_deg),
-            format!("{:+.2}°", effect.bias_deg),
-            optional(effect.right_way_share, |share| format!("{:.0} %", 100.0 * share)),
-            optional(effect.mae_deg, degrees),
-            effect.passed.map_or("", |passed| if passed { "good" } else { "BAD" }).into(),
-            effect.verdict.clone(),
-        ]
-    }));
-    (headers, rows)
-}
-
-/// The page.
-pub fn page(title: &str, pilot: &Pilot, found: &Counterfactuals, exhibits: &Exhibits) -> String {
-    let recipe = pilot.recipe();
-    let lead = format!("Recipe {}; {} pictures. Angles are those of the front wheels.", recipe.name, found.pictures);
-    let mut page = Page::new(title, &lead);
-    page.section("What does it look at?");
-    for sentence in &found.verdict {
-        page.advice(sentence, found.effects.iter().all(|effect| effect.passed != Some(false)));
-    }
-    page.paragraph(
-        "Each picture was changed in one way at a time. \"Moves by\" is the mean distance between the angles before and after; a \
-         mirrored picture should give the negated angle. Masked parts take the mean colour of their row. Where the road lies is \
-         taken from Udacity's camera: from the horizon at 35 % of the height down to the bonnet at 85 %.",
-    );
-    let (headers, rows) = table(found);
-    page.table(&headers, &rows);
-    page.subsection("One picture in all its changes");
-    page.figures(4, &figures(&exhibits.changes, true));
-    page.section("What excites it");
-    page.paragraph(&format!(
-        "VisualBackProp: yellow excites the convolutions a little, red much. From the hardest left to the hardest right. The lines \
-         show the label (blue) and the model (orange), at {STEERING_SCALE} times the angle of the wheels."
-    ));
-    page.figures(3, &figures(&exhibits.saliency, true));
-    page.section("Filters and feature maps");
-    page.figures(1, &exhibits.filters.iter().map(|exhibit| figure(exhibit, false)).collect::<Vec<_>>());
-    page.figures(1, &figures(&exhibits.features, false));
-    page.finish()
-}
-
-fn figures(exhibits: &[Exhibit], photograph: bool) -> Vec<Figure> {
-    exhibits.iter().map(|exhibit| figure(exhibit, photograph)).collect()
-}
-
-fn figure(exhibit: &Exhibit, photograph: bool) -> Figure {
-    let source = if photograph { exhibit.picture.jpeg_address() } else { exhibit.picture.png_address() };
-    Figure { source, caption: exhibit.caption.clone(), pixelated: !photograph }
 }

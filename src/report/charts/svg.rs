@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use super::palette::INK;
+use crate::report::charts::palette::INK;
 
 /// Fonts every system has one of.
 pub const FONT: &str = "system-ui, -apple-system, 'Segoe UI', 'DejaVu Sans', Arial, sans-serif";

@@ -2,9 +2,9 @@
 
 use std::path::{Path, PathBuf};
 
-use crate::dataset::decode::{RgbImage, decode_rgb};
 use crate::dataset::{self, Camera};
 use crate::error::{Error, Result};
+use crate::picture::{RgbImage, decode::decode_rgb};
 use crate::simulator::camera::jpeg::RoundTrip;
 use crate::simulator::recorder::record::{Sample, drive_expert};
 use crate::simulator::{Camera as View, HEIGHT, Mount, RecordOptions, Renderer, RgbFrame, Track, Variant, WIDTH};

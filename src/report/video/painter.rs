@@ -4,12 +4,12 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use crate::dataset::decode::RgbImage;
+use super::lettering::{Size, draw_text, draw_text_right, end_of};
 use crate::dataset::resize::{Interpolation, Resizer};
-use crate::report::lettering::{Size, end_of};
-use crate::report::map::{self, Projection};
-use crate::report::palette::heat;
-use crate::report::picture::{HUMAN, MODEL};
+use crate::picture::RgbImage;
+use crate::report::charts::map::{self, Projection};
+use crate::report::charts::palette::heat;
+use crate::report::charts::steering_line::{HUMAN, MODEL, draw_steering};
 use crate::simulator::Track;
 use crate::simulator::car::dynamics::MAX_STEER_DEG;
 
@@ -44,7 +44,7 @@ const ROAD_EDGE: [u8; 3] = [0x90; 3];
 
 /// A moment, as far as it is known.
 #[derive(Clone, Debug, Default)]
-pub struct Scene {
+pub struct FilmFrame {
     /// What the camera shows.
     pub picture: RgbImage,
     /// Time since the beginning, s.
@@ -69,7 +69,7 @@ pub struct Scene {
 
 /// The names that stand in a video.
 #[derive(Clone, Debug)]
-pub struct Names {
+pub struct Captions {
     /// What is driven on, or what was recorded.
     pub title: String,
     /// What else to know, in one line.
@@ -81,8 +81,8 @@ pub struct Names {
 }
 
 /// Paints scenes. Keeps the way so far.
-pub struct Panel {
-    names: Names,
+pub struct Painter {
+    names: Captions,
     /// Everything that stays, with the way on the map.
     base: RgbImage,
     projection: Option<Projection>,
@@ -98,18 +98,25 @@ struct Camera {
     picture: RgbImage,
 }
 
-impl Panel {
-    /// An empty panel, with a map if the track is known.
-    pub fn new(names: Names, track: Option<&Track>) -> Panel {
+impl Painter {
+    /// An empty painter, with a map if the track is known.
+    pub fn new(names: Captions, track: Option<&Track>) -> Painter {
         let mut base = RgbImage::filled(SIZE[0], SIZE[1], GROUND);
         let letters = |size: Size, bold| (ASIDE[1] - ASIDE[0]) / size.advance(bold);
-        base.draw_text([ASIDE[0], 10], Size::Medium, true, INK, &end_of(&names.title, letters(Size::Medium, true)));
+        draw_text(
+            &mut base,
+            [ASIDE[0], 10],
+            Size::Medium,
+            true,
+            INK,
+            &end_of(&names.title, letters(Size::Medium, true)),
+        );
         let subtitle = end_of(&names.subtitle, letters(Size::Small, false));
-        base.draw_text([ASIDE[0], 36], Size::Small, false, QUIET_INK, &subtitle);
+        draw_text(&mut base, [ASIDE[0], 36], Size::Small, false, QUIET_INK, &subtitle);
         let projection = track.and_then(|track| draw_track(&mut base, track));
-        let mut panel = Panel { names, base, projection, last_place: None, camera: None, trace: VecDeque::new() };
-        panel.draw_scales();
-        panel
+        let mut painter = Painter { names, base, projection, last_place: None, camera: None, trace: VecDeque::new() };
+        painter.draw_scales();
+        painter
     }
 
     /// Height and width of the pictures.
@@ -117,20 +124,20 @@ impl Panel {
         SIZE
     }
 
-    /// Adds a scene to the way and to the steering so far.
-    pub(super) fn notice(&mut self, scene: &Scene) {
-        self.trace.push_back((scene.time_s, scene.model_deg, scene.reference_deg));
-        while self.trace.front().is_some_and(|(time_s, ..)| *time_s < scene.time_s - TRACE_S) {
+    /// Adds a frame to the way and to the steering so far.
+    pub(super) fn notice(&mut self, frame: &FilmFrame) {
+        self.trace.push_back((frame.time_s, frame.model_deg, frame.reference_deg));
+        while self.trace.front().is_some_and(|(time_s, ..)| *time_s < frame.time_s - TRACE_S) {
             self.trace.pop_front();
         }
-        let (Some(place), Some(projection)) = (scene.place, &self.projection) else { return };
+        let (Some(place), Some(projection)) = (frame.place, &self.projection) else { return };
         let to = projection.place(place);
-        match self.last_place.filter(|_| !scene.put_back) {
+        match self.last_place.filter(|_| !frame.put_back) {
             Some(from) => {
-                let colour = heat(map::share(scene.cte_m.unwrap_or_default()));
+                let colour = heat(map::share(frame.cte_m.unwrap_or_default()));
                 self.base.draw_line(from, to, 3.0, colour);
             }
-            None if scene.put_back => {
+            None if frame.put_back => {
                 for [dx, dy] in [[4.0, 4.0], [4.0, -4.0]] {
                     self.base.draw_line([to[0] - dx, to[1] - dy], [to[0] + dx, to[1] + dy], 1.6, INK);
                 }
@@ -140,14 +147,14 @@ impl Panel {
         self.last_place = Some(to);
     }
 
-    /// Paints `scene`, the last that was noticed.
-    pub(super) fn paint(&mut self, scene: &Scene, out: &mut RgbImage) {
+    /// Paints `frame`, the last that was noticed.
+    pub(super) fn paint(&mut self, frame: &FilmFrame, out: &mut RgbImage) {
         out.clone_from(&self.base);
-        self.paint_camera(scene, out);
-        self.paint_wheel(scene, out);
-        self.paint_angles(scene, out);
-        self.paint_figures(scene, out);
-        self.paint_trace(scene.time_s, out);
+        self.paint_camera(frame, out);
+        self.paint_wheel(frame, out);
+        self.paint_angles(frame, out);
+        self.paint_figures(frame, out);
+        self.paint_trace(frame.time_s, out);
         if let Some(at) = self.last_place {
             out.draw_line(at, at, 13.0, GROUND);
             out.draw_line(at, at, 10.0, INK);
@@ -159,7 +166,7 @@ impl Panel {
         let width = text.chars().count() * Size::Large.advance(true);
         let left = (CAMERA[1] / 2).saturating_sub(width / 2);
         fill(out, [left as f64 - 12.0, 24.0, (left + width) as f64 + 12.0, 60.0], GROUND);
-        out.draw_text([left, 30], Size::Large, true, INK, text);
+        draw_text(out, [left, 30], Size::Large, true, INK, text);
     }
 
     /// What stands around the numbers and curves.
@@ -170,7 +177,7 @@ impl Panel {
         for (row, name, colour) in [(0, self.names.model, MODEL), (1, Some(self.names.reference), HUMAN)] {
             let Some(name) = name else { continue };
             let top = 330 + 36 * row;
-            base.draw_text([164, top + 2], Size::Medium, true, INK, name);
+            draw_text(base, [164, top + 2], Size::Medium, true, INK, name);
             fill(base, [164.0, top as f64 + 24.0, 226.0, top as f64 + 27.0], colour);
             fill(base, [BAR[0], top as f64 + 2.0, BAR[1], top as f64 + 26.0], [0xf2; 3]);
         }
@@ -179,19 +186,19 @@ impl Panel {
             fill(base, [x - 0.5, 328.0, x + 0.5, 396.0], if deg == 0.0 { INK } else { [0xb8; 3] });
             let text = format!("{deg:.0}°");
             let half = text.chars().count() * Size::Small.advance(false) / 2;
-            base.draw_text([x as usize - half, 398], Size::Small, false, QUIET_INK, &text);
+            draw_text(base, [x as usize - half, 398], Size::Small, false, QUIET_INK, &text);
         }
-        base.draw_text([BAR[0] as usize - 40, 398], Size::Small, false, QUIET_INK, "left");
-        base.draw_text([BAR[1] as usize, 398], Size::Small, false, QUIET_INK, "right");
-        base.draw_text([ASIDE[0], bottom as usize + 4], Size::Small, false, QUIET_INK, "steering, last 10 s");
+        draw_text(base, [BAR[0] as usize - 40, 398], Size::Small, false, QUIET_INK, "left");
+        draw_text(base, [BAR[1] as usize, 398], Size::Small, false, QUIET_INK, "right");
+        draw_text(base, [ASIDE[0], bottom as usize + 4], Size::Small, false, QUIET_INK, "steering, last 10 s");
     }
 
     fn trace_edges(&self) -> [f64; 2] {
         if self.projection.is_some() { TRACE } else { LONE_TRACE }
     }
 
-    fn paint_camera(&mut self, scene: &Scene, out: &mut RgbImage) {
-        let from = [scene.picture.height, scene.picture.width];
+    fn paint_camera(&mut self, frame: &FilmFrame, out: &mut RgbImage) {
+        let from = [frame.picture.height, frame.picture.width];
         if from.contains(&0) {
             return;
         }
@@ -199,10 +206,10 @@ impl Panel {
             Some(camera) if camera.from == from => camera,
             other => other.insert(Camera::new(from)),
         };
-        camera.resizer.apply(&scene.picture.pixels, &mut camera.picture.pixels);
-        for (deg, colour) in [(scene.reference_deg, HUMAN), (scene.model_deg, MODEL)] {
+        camera.resizer.apply(&frame.picture.pixels, &mut camera.picture.pixels);
+        for (deg, colour) in [(frame.reference_deg, HUMAN), (frame.model_deg, MODEL)] {
             if let Some(deg) = deg {
-                camera.picture.draw_steering(deg, colour);
+                draw_steering(&mut camera.picture, deg, colour);
             }
         }
         let (top, left) = ((CAMERA[0] - camera.picture.height) / 2, (CAMERA[1] - camera.picture.width) / 2);
@@ -210,9 +217,9 @@ impl Panel {
     }
 
     /// The wheel stands as who drives holds it; a mark on its rim shows where the other would.
-    fn paint_wheel(&self, scene: &Scene, out: &mut RgbImage) {
+    fn paint_wheel(&self, frame: &FilmFrame, out: &mut RgbImage) {
         let ([x, y], radius) = WHEEL;
-        let Some(deg) = scene.model_deg.or(scene.reference_deg) else { return };
+        let Some(deg) = frame.model_deg.or(frame.reference_deg) else { return };
         let at = |angle_deg: f64, r: f64| {
             let (sin, cos) = angle_deg.to_radians().sin_cos();
             [x + r * sin, y - r * cos]
@@ -227,50 +234,50 @@ impl Panel {
         }
         out.draw_line([x, y], [x, y], 26.0, [0x3a; 3]);
         // The top of the wheel, in the colour of who holds it.
-        let holds = if scene.model_deg.is_some() { MODEL } else { HUMAN };
+        let holds = if frame.model_deg.is_some() { MODEL } else { HUMAN };
         out.draw_line(at(turn - 9.0, radius), at(turn + 9.0, radius), 9.0, holds);
-        if let (Some(_), Some(reference)) = (scene.model_deg, scene.reference_deg) {
+        if let (Some(_), Some(reference)) = (frame.model_deg, frame.reference_deg) {
             let turn = WHEEL_RATIO * reference;
             out.draw_line(at(turn, radius - 14.0), at(turn, radius + 8.0), 6.0, GROUND);
             out.draw_line(at(turn, radius - 13.0), at(turn, radius + 7.0), 3.0, HUMAN);
         }
     }
 
-    fn paint_angles(&self, scene: &Scene, out: &mut RgbImage) {
+    fn paint_angles(&self, frame: &FilmFrame, out: &mut RgbImage) {
         let middle = f64::midpoint(BAR[0], BAR[1]);
-        for (row, deg, colour) in [(0, scene.model_deg, MODEL), (1, scene.reference_deg, HUMAN)] {
+        for (row, deg, colour) in [(0, frame.model_deg, MODEL), (1, frame.reference_deg, HUMAN)] {
             let Some(deg) = deg else { continue };
             let top = 330 + 36 * row;
-            out.draw_text_right([632, top + 1], Size::Large, true, INK, &(signed(deg, 1) + "°"));
+            draw_text_right(out, [632, top + 1], Size::Large, true, INK, &(signed(deg, 1) + "°"));
             let end = middle + (deg / MAX_STEER_DEG).clamp(-1.0, 1.0) * (BAR[1] - BAR[0]) / 2.0;
             let (left, right) = (middle.min(end), middle.max(end));
             fill(out, [left - 1.0, top as f64 + 5.0, right + 1.0, top as f64 + 23.0], colour);
         }
     }
 
-    fn paint_figures(&self, scene: &Scene, out: &mut RgbImage) {
-        let tenths = (10.0 * scene.time_s).round() as u64;
-        let apart = scene.model_deg.zip(scene.reference_deg).map(|(a, b)| format!("{:.1}°", (a - b).abs()));
+    fn paint_figures(&self, frame: &FilmFrame, out: &mut RgbImage) {
+        let tenths = (10.0 * frame.time_s).round() as u64;
+        let apart = frame.model_deg.zip(frame.reference_deg).map(|(a, b)| format!("{:.1}°", (a - b).abs()));
         let beside = match self.projection {
-            Some(_) => ("from line", scene.cte_m.map(|m| signed(m, 2) + " m")),
+            Some(_) => ("from line", frame.cte_m.map(|m| signed(m, 2) + " m")),
             None => ("apart", apart),
         };
-        let lap = scene.lap.map(|(lap, laps)| match laps {
+        let lap = frame.lap.map(|(lap, laps)| match laps {
             Some(laps) => format!("{lap}/{laps}"),
             None => lap.to_string(),
         });
         let figures = [
-            ("speed", scene.speed_mph.map(|mph| format!("{mph:.1} mph"))),
+            ("speed", frame.speed_mph.map(|mph| format!("{mph:.1} mph"))),
             beside,
-            ("answer in", scene.answered_in.map(|took| format!("{:.1} ms", 1000.0 * took.as_secs_f64()))),
+            ("answer in", frame.answered_in.map(|took| format!("{:.1} ms", 1000.0 * took.as_secs_f64()))),
             ("lap", lap),
             ("time", Some(format!("{}:{:02}.{}", tenths / 600, tenths / 10 % 60, tenths % 10))),
         ];
         // What is not known has no place; what is known keeps it.
         for ((caption, text), left) in figures.iter().zip([164, 272, 372, 472, 544]) {
             if let Some(text) = text {
-                out.draw_text([left, 426], Size::Medium, true, INK, text);
-                out.draw_text([left, 450], Size::Small, false, QUIET_INK, caption);
+                draw_text(out, [left, 426], Size::Medium, true, INK, text);
+                draw_text(out, [left, 450], Size::Small, false, QUIET_INK, caption);
             }
         }
     }
@@ -286,7 +293,7 @@ impl Panel {
             out.draw_line([left, y(deg)], [right, y(deg)], 1.0, grey);
         }
         let range = format!("±{range_deg:.0}°");
-        out.draw_text_right([ASIDE[1], bottom as usize + 4], Size::Small, false, QUIET_INK, &range);
+        draw_text_right(out, [ASIDE[1], bottom as usize + 4], Size::Small, false, QUIET_INK, &range);
         let x = |time_s: f64| right - (now_s - time_s) / TRACE_S * (right - left);
         type Moment = (f64, Option<f64>, Option<f64>);
         let mut curve = |of: fn(&Moment) -> Option<f64>, colour| {
@@ -346,9 +353,9 @@ fn draw_track(base: &mut RgbImage, track: &Track) -> Option<Projection> {
     let right = ASIDE[1] as f64;
     fill(base, [right - bar_px, top as f64 + 4.0, right, top as f64 + 7.0], INK);
     let darkest = format!("0 to {:.0} m+ from line", map::DARKEST_M);
-    base.draw_text([left, top + 14], Size::Small, false, QUIET_INK, &darkest);
-    base.draw_text_right([ASIDE[1], top + 14], Size::Small, false, QUIET_INK, &format!("{bar_m:.0} m"));
-    base.draw_text([left, top + 32], Size::Small, false, QUIET_INK, "× put back");
+    draw_text(base, [left, top + 14], Size::Small, false, QUIET_INK, &darkest);
+    draw_text_right(base, [ASIDE[1], top + 14], Size::Small, false, QUIET_INK, &format!("{bar_m:.0} m"));
+    draw_text(base, [left, top + 32], Size::Small, false, QUIET_INK, "× put back");
     Some(projection)
 }
 
@@ -367,8 +374,8 @@ fn fill(picture: &mut RgbImage, [left, top, right, bottom]: [f64; 4], rgb: [u8; 
 mod tests {
     use super::*;
 
-    fn names() -> Names {
-        Names { title: "lake".into(), subtitle: "a model".into(), model: Some("model"), reference: "expert" }
+    fn names() -> Captions {
+        Captions { title: "lake".into(), subtitle: "a model".into(), model: Some("model"), reference: "expert" }
     }
 
     /// Pixels of a part of the picture that have the colour.
@@ -379,19 +386,19 @@ mod tests {
             .count()
     }
 
-    fn scene(model_deg: f64, reference_deg: f64) -> Scene {
+    fn frame(model_deg: f64, reference_deg: f64) -> FilmFrame {
         let picture = RgbImage::filled(160, 320, [90, 120, 150]);
-        Scene { picture, model_deg: Some(model_deg), reference_deg: Some(reference_deg), ..Scene::default() }
+        FilmFrame { picture, model_deg: Some(model_deg), reference_deg: Some(reference_deg), ..FilmFrame::default() }
     }
 
     #[test]
     fn bars_and_wheel_show_who_steers_where_and_how_far() {
-        let mut panel = Panel::new(names(), None);
+        let mut painter = Painter::new(names(), None);
         let mut out = RgbImage::default();
         let mut bars = |model_deg, reference_deg| {
-            let scene = scene(model_deg, reference_deg);
-            panel.notice(&scene);
-            panel.paint(&scene, &mut out);
+            let frame = frame(model_deg, reference_deg);
+            painter.notice(&frame);
+            painter.paint(&frame, &mut out);
             let middle = f64::midpoint(BAR[0], BAR[1]) as usize;
             let (left, right) = ([BAR[0] as usize, 324, middle - 2, 396], [middle + 2, 324, BAR[1] as usize, 396]);
             [(left, MODEL), (right, MODEL), (left, HUMAN), (right, HUMAN)]
@@ -407,25 +414,25 @@ mod tests {
     #[test]
     fn the_way_grows_on_the_map_in_the_colour_of_its_error_and_is_not_drawn_where_the_car_was_lifted() {
         let track = Track::load("lake").unwrap();
-        let mut panel = Panel::new(names(), Some(&track));
-        let way = |panel: &mut Panel, s_m: f64, cte_m: f64, put_back| {
+        let mut painter = Painter::new(names(), Some(&track));
+        let way = |painter: &mut Painter, s_m: f64, cte_m: f64, put_back| {
             let station = track.at(s_m);
             let place = Some([station.x, station.y]);
-            panel.notice(&Scene { place, put_back, cte_m: Some(cte_m), ..scene(0.0, 0.0) });
+            painter.notice(&FilmFrame { place, put_back, cte_m: Some(cte_m), ..frame(0.0, 0.0) });
         };
         let map = MAP.map(|edge| edge as usize);
         let [near, far] = [0.1, 1.9].map(|cte_m| heat(map::share(cte_m)));
-        let before = count(&panel.base, map, far);
+        let before = count(&painter.base, map, far);
         for k in 0..50 {
-            way(&mut panel, f64::from(k), 0.1, false);
+            way(&mut painter, f64::from(k), 0.1, false);
         }
-        let first = count(&panel.base, map, near);
-        assert!(first > 20 && count(&panel.base, map, far) == before);
+        let first = count(&painter.base, map, near);
+        assert!(first > 20 && count(&painter.base, map, far) == before);
         for k in 0..50 {
-            way(&mut panel, 200.0 + f64::from(k), 1.9, k == 0);
+            way(&mut painter, 200.0 + f64::from(k), 1.9, k == 0);
         }
-        let second = count(&panel.base, map, far) - before;
-        assert!(second > 20 && count(&panel.base, map, near) <= first);
+        let second = count(&painter.base, map, far) - before;
+        assert!(second > 20 && count(&painter.base, map, near) <= first);
         assert!(second < 3 * first, "no line leads from one stretch to the other: {second}");
     }
 
@@ -436,12 +443,13 @@ mod tests {
 
     #[test]
     fn pictures_of_any_size_lie_within_the_camera_and_text_is_not_cut_off() {
-        let mut panel = Panel::new(Names { title: "x".repeat(200), ..names() }, None);
+        let mut painter = Painter::new(Captions { title: "x".repeat(200), ..names() }, None);
         let mut out = RgbImage::default();
         for size in [[120, 160], [160, 320], [1, 1], [40, 900], [2000, 30]] {
-            let scene = Scene { picture: RgbImage::filled(size[0], size[1], [200, 10, 10]), ..Scene::default() };
-            panel.notice(&scene);
-            panel.paint(&scene, &mut out);
+            let frame =
+                FilmFrame { picture: RgbImage::filled(size[0], size[1], [200, 10, 10]), ..FilmFrame::default() };
+            painter.notice(&frame);
+            painter.paint(&frame, &mut out);
             let inside = count(&out, [0, 0, CAMERA[1], CAMERA[0]], [200, 10, 10]);
             assert!(inside > 0 && count(&out, [0, 0, 960, 480], [200, 10, 10]) == inside, "{size:?}");
         }

@@ -6,22 +6,13 @@ use zune_jpeg::zune_core::bytestream::ZCursor;
 use zune_jpeg::zune_core::colorspace::ColorSpace;
 use zune_jpeg::zune_core::options::DecoderOptions;
 
+use super::RgbImage;
+
 /// Largest height or width that is decoded, in pixels.
 pub const MAX_SIDE: usize = 8192;
 
 /// First bytes of every PNG file.
 const PNG_SIGNATURE: &[u8] = b"\x89PNG\r\n\x1a\n";
-
-/// An 8-bit RGB image, `[height][width][3]`. The buffer is reused from image to image.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct RgbImage {
-    /// Height in pixels.
-    pub height: usize,
-    /// Width in pixels.
-    pub width: usize,
-    /// Pixels, row by row, red first.
-    pub pixels: Vec<u8>,
-}
 
 /// Decodes a JPEG or PNG file held in `bytes` into `image`.
 ///

@@ -1,7 +1,7 @@
 //! Charts: axes with units, a legend, lines, steps, dots and bars.
 
-use super::palette::{GRID, INK, QUIET_INK};
-use super::svg::{Anchor, Svg, text_width};
+use crate::report::charts::palette::{GRID, INK, QUIET_INK};
+use crate::report::charts::svg::{Anchor, Svg, text_width};
 
 /// Size of the labels of the ticks, pixels.
 const TICK_SIZE: f64 = 12.0;

@@ -4,18 +4,19 @@ use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
 
-use super::chart::{Axis, Chart, Mark};
-use super::html::{Figure, Page};
-use super::picture::{self, STEERING_SCALE};
-use super::split_view::SplitView;
-use super::steering::histogram;
-use super::{Metrics, Prediction, network_diagram, palette};
 use crate::dataset::held_out::trained_on_held_out;
 use crate::dataset::{Camera, Item};
 use crate::engine::network::{Network, group_digits};
 use crate::error::Result;
 use crate::files::atomic_file;
+use crate::metrics::{Metrics, Prediction};
 use crate::pilot::Pilot;
+use crate::report::charts::chart::{Axis, Chart, Mark};
+use crate::report::charts::steering::histogram;
+use crate::report::charts::steering_line::{HUMAN, MODEL, STEERING_SCALE, draw_steering};
+use crate::report::charts::{network_diagram, palette};
+use crate::report::pages::html::{Figure, Page};
+use crate::report::pages::split_view::SplitView;
 use crate::training::{Data, EpochRecord, RunFolder, RunInfo, TrainResult};
 
 /// Worst frames shown.
@@ -297,10 +298,10 @@ fn worst(page: &mut Page, answers: &[Answer], data: &Data, full_lock_deg: f64) {
         .filter_map(|Answer { item, prediction }| {
             let recording = &data.recordings()[usize::from(item.recording)];
             let row = item.row as usize;
-            let mut image = picture::read(recording, row, Camera::Centre)?;
+            let mut image = recording.picture(row, Camera::Centre)?;
             let [human_deg, model_deg] = [prediction.label, prediction.steering].map(|s| f64::from(s) * full_lock_deg);
-            image.draw_steering(human_deg, picture::HUMAN);
-            image.draw_steering(model_deg, picture::MODEL);
+            draw_steering(&mut image, human_deg, HUMAN);
+            draw_steering(&mut image, model_deg, MODEL);
             let name = recording.path.file_name().unwrap_or_default().to_string_lossy().into_owned();
             let caption = format!(
                 "{name}, line {}\nhuman {human_deg:+.1}°, model {model_deg:+.1}°: {:.1}° off",

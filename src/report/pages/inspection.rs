@@ -1,17 +1,16 @@
 //! The page of `inspect --out`: what a recording looks like, before anything is trained on it.
 
-use super::chart::{Axis, Chart, Mark};
-use super::html::{Figure, Page};
-use super::palette;
-use super::picture;
-use super::split_view::SplitView;
-use super::steering::{driven_times, histogram};
 use crate::dataset::colour::Colour;
-use crate::dataset::decode::RgbImage;
 use crate::dataset::inspect::{Inspection, Suspicion, contradiction, seen_steering};
 use crate::dataset::preprocess::Preprocessing;
 use crate::dataset::{Camera, Recording};
+use crate::picture::RgbImage;
 use crate::recipe::Recipe;
+use crate::report::charts::chart::{Axis, Chart, Mark};
+use crate::report::charts::palette;
+use crate::report::charts::steering::{driven_times, histogram};
+use crate::report::pages::html::{Figure, Page};
+use crate::report::pages::split_view::SplitView;
 
 /// Rows of the sample sheet, worst frames, and frames in all colour spaces, for a page of one recording.
 const SAMPLES: usize = 5;
@@ -231,7 +230,7 @@ fn samples(page: &mut Page, recording: &Recording, recipe: &Recipe, count: usize
     for row in from_left_to_right(recording, count) {
         let (line, steering) = (recording.rows[row].line, recording.rows[row].steering);
         for &camera in &cameras {
-            let Some(image) = picture::read(recording, row, camera) else { continue };
+            let Some(image) = recording.picture(row, camera) else { continue };
             let label = if recipe.samples.side_cameras.is_some() || camera == Camera::Centre {
                 format!("{:+.3}", recipe.samples.label(steering, camera))
             } else {
@@ -239,7 +238,7 @@ fn samples(page: &mut Page, recording: &Recording, recipe: &Recipe, count: usize
             };
             figures.push(camera_figure(&image, format!("line {line}, {}: label {label}", camera.name())));
             if camera == *cameras.last().unwrap_or(&Camera::Centre)
-                && let Some(centre) = picture::read(recording, row, Camera::Centre)
+                && let Some(centre) = recording.picture(row, Camera::Centre)
             {
                 figures.push(camera_figure(
                     &centre.mirrored(),
@@ -263,7 +262,7 @@ fn colours(page: &mut Page, recording: &Recording, spec: &Preprocessing, count: 
     let mut rows = from_left_to_right(recording, count.max(2));
     rows.truncate(count);
     for row in rows {
-        let Some(image) = picture::read(recording, row, Camera::Centre) else { continue };
+        let Some(image) = recording.picture(row, Camera::Centre) else { continue };
         page.subsection(&format!("Line {}, label {:+.3}", recording.rows[row].line, recording.rows[row].steering));
         let mut figures =
             vec![camera_figure(&kept_rows(&image, spec), "the camera's picture; what is kept is not darkened".into())];
@@ -346,7 +345,7 @@ fn worst(page: &mut Page, inspection: &Inspection, count: usize) {
     let figures: Vec<Figure> = chosen
         .into_iter()
         .filter_map(|(row, why)| {
-            let image = picture::read(recording, row, Camera::Centre)?;
+            let image = recording.picture(row, Camera::Centre)?;
             let (line, steering) = (recording.rows[row].line, recording.rows[row].steering);
             Some(camera_figure(&image, format!("line {line}, label {steering:+.3}\n{why}")))
         })

@@ -1,8 +1,8 @@
 //! Charts of steering that several pages share.
 
-use super::chart::{Axis, Chart, Mark};
-use super::palette;
 use crate::dataset::Recording;
+use crate::report::charts::chart::{Axis, Chart, Mark};
+use crate::report::charts::palette;
 
 /// Bins of a histogram of labels in [-1, 1]; the middle one is centred at 0.
 const BINS: usize = 41;

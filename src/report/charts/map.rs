@@ -1,9 +1,9 @@
 //! A track from above, with the way a car took, coloured by its distance from the line.
 
-use super::palette::{INK, QUIET_INK, heat_hex};
-use super::svg::{Anchor, Svg};
 use crate::error::{Error, Result};
 use crate::files::new_folder::NewFolder;
+use crate::report::charts::palette::{INK, QUIET_INK, heat_hex};
+use crate::report::charts::svg::{Anchor, Svg};
 use crate::simulator::trial::run::Moment;
 use crate::simulator::{DriveResult, DriveSummary, Track};
 
@@ -14,7 +14,7 @@ pub(crate) const COLOURS: usize = 8;
 
 /// A moment of a drive.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Place {
+pub struct MapPoint {
     /// East, m.
     pub x: f64,
     /// North, m.
@@ -35,8 +35,8 @@ const PAGE: [f64; 2] = [760.0, 620.0];
 ///
 /// If it cannot be written.
 pub fn write(track: &Track, result: &DriveResult, folder: &NewFolder) -> Result<()> {
-    let place = |m: &Moment| Place { x: m.x, y: m.y, cte_m: m.cte_m, put_back: m.intervention };
-    let drives: Vec<Vec<Place>> =
+    let place = |m: &Moment| MapPoint { x: m.x, y: m.y, cte_m: m.cte_m, put_back: m.intervention };
+    let drives: Vec<Vec<MapPoint>> =
         result.runs.iter().map(|pair| pair.assisted.moments.iter().map(place).collect()).collect();
     let DriveSummary { runs, interventions, .. } = result.summary;
     let title = format!("{}, runs: {runs}, put back: {interventions}", track.name());
@@ -46,7 +46,7 @@ pub fn write(track: &Track, result: &DriveResult, folder: &NewFolder) -> Result<
 }
 
 /// Draws `drives` on `track`, if it is known, within `size` (width, height) pixels.
-pub fn draw(title: &str, track: Option<&Track>, drives: &[Vec<Place>], size: [f64; 2]) -> String {
+pub fn draw(title: &str, track: Option<&Track>, drives: &[Vec<MapPoint>], size: [f64; 2]) -> String {
     let mut svg = Svg::new(size[0], size[1]);
     svg.text([14.0, 22.0], 15.0, Anchor::Start, "font-weight=\"600\"", title);
     let edges = track.map(edges).unwrap_or_default();
@@ -78,7 +78,7 @@ pub fn draw(title: &str, track: Option<&Track>, drives: &[Vec<Place>], size: [f6
 
 /// How a map lies in a picture: north is up, and both directions have one scale.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Projection {
+pub(crate) struct Projection {
     /// Pixels for each metre.
     pub scale: f64,
     shift: [f64; 2],
@@ -114,13 +114,13 @@ fn step(cte_m: f64) -> usize {
     ((cte_m.abs() / DARKEST_M * COLOURS as f64) as usize).min(COLOURS - 1)
 }
 
-/// The place in [`heat`](super::palette::heat) of a step of colour; the lightest would not show on the road.
+/// The place in [`heat`](crate::report::charts::palette::heat) of a step of colour; the lightest would not show on the road.
 pub(crate) fn step_share(step: usize) -> f64 {
     0.25 + 0.75 * step as f64 / (COLOURS - 1) as f64
 }
 
-/// The place in [`heat`](super::palette::heat) of a distance from the line, m.
-pub(super) fn share(cte_m: f64) -> f64 {
+/// The place in [`heat`](crate::report::charts::palette::heat) of a distance from the line, m.
+pub(crate) fn share(cte_m: f64) -> f64 {
     step_share(step(cte_m))
 }
 
@@ -137,7 +137,7 @@ pub(crate) fn edges(track: &Track) -> Vec<Vec<[f64; 2]>> {
 }
 
 /// Draws a way in stretches of one colour.
-fn way(svg: &mut Svg, drive: &[Place], place: &impl Fn([f64; 2]) -> [f64; 2]) {
+fn way(svg: &mut Svg, drive: &[MapPoint], place: &impl Fn([f64; 2]) -> [f64; 2]) {
     let mut from = 0;
     for i in 1..=drive.len() {
         let ends = i == drive.len() || drive[i].put_back || step(drive[i].cte_m) != step(drive[from].cte_m);
@@ -190,9 +190,10 @@ mod tests {
         let track = Track::load("lake").unwrap();
         let place = |s_m: f64, cte_m: f64, put_back: bool| {
             let station = track.at(s_m);
-            Place { x: station.x + cte_m * station.ty, y: station.y - cte_m * station.tx, cte_m, put_back }
+            MapPoint { x: station.x + cte_m * station.ty, y: station.y - cte_m * station.tx, cte_m, put_back }
         };
-        let drive: Vec<Place> = (0..40).map(|i| place(f64::from(i), if i < 20 { 0.1 } else { 1.9 }, i == 30)).collect();
+        let drive: Vec<MapPoint> =
+            (0..40).map(|i| place(f64::from(i), if i < 20 { 0.1 } else { 1.9 }, i == 30)).collect();
         let text = draw("lake", Some(&track), &[drive], [552.0, 420.0]);
         assert!(roxmltree::Document::parse(&text).is_ok());
         // Two edges, and three stretches: near the line, far from it, after the car was put back.
