@@ -65,7 +65,7 @@
 //! # */
 //! // The recipe is the experiment: preprocessing, network, split, optimizer. A path ending in .toml names one of your own.
 //! let recipe = Recipe::find("lenet", &["epochs=2".into(), "batch=16".into()])?;
-//! let request = TrainRequest { recordings: vec!["data/sample".into()], recipe, out, seed: 1, cache_mib: 64, from: None };
+//! let request = TrainRequest { recordings: vec!["data/sample".into()], recipe, out, seed: 1, cache_mib: 64, from: None, algorithm: None };
 //! let stop = AtomicBool::new(false); // set from elsewhere, it ends the run after the current batch
 //! let result = train(request, &mut Printer, &stop)?;
 //! println!("{}: mean squared error {:?} on the validation side", result.model.display(), result.val_mse);
@@ -167,6 +167,7 @@ pub mod recipe;
 pub mod report;
 pub mod serve;
 pub mod simulator;
+mod text;
 pub mod training;
 
 pub use error::{Error, Result};

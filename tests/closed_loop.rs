@@ -37,6 +37,7 @@ fn learn(folder: &Path, threads: usize) -> (TrainResult, TrackResult) {
             seed: 1,
             cache_mib: 256,
             from: None,
+            algorithm: None,
         };
         let result = train(request, &mut Silent, &AtomicBool::new(false)).unwrap();
         let pilot = Pilot::load(&result.model).unwrap();
@@ -107,8 +108,14 @@ fn a_job_that_was_stopped_goes_on_through_dagger_to_the_drives() {
     let folder = tempfile::tempdir().unwrap();
     let never = AtomicBool::new(false);
     let note = JobNote { runs: 1, dagger_rounds: 1, round: 0 };
-    let request =
-        |name: &str| JobRequest { recipe: lenet(2), out: folder.path().join(name), seed: 5, cache_mib: 64, from: None };
+    let request = |name: &str| JobRequest {
+        recipe: lenet(2),
+        out: folder.path().join(name),
+        seed: 5,
+        cache_mib: 64,
+        from: None,
+        algorithm: None,
+    };
     let (mut watcher, scope) = (Silent, small_scope(folder.path()));
     let mut whole = Job::new(scope.clone(), note.clone(), &mut watcher, &Silent, &never);
     let expected = whole.begin(request("whole")).unwrap();

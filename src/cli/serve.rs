@@ -1,6 +1,6 @@
 //! `steersman serve`: drives Udacity's simulator, or any client that speaks its protocol.
 
-use std::io::{IsTerminal, Write as _};
+use std::io::IsTerminal;
 use std::net::{IpAddr, SocketAddr};
 use std::path::PathBuf;
 use std::sync::Mutex;
@@ -13,6 +13,7 @@ use super::{or_dash, print_json, stop_on_ctrl_c};
 use crate::error::{Error, Result};
 use crate::pilot::Pilot;
 use crate::serve::{Console, HelmOptions, Server, ServerOptions, Summary, protocol};
+use crate::text::escaped;
 
 /// Drive Udacity's simulator with a model; it connects by itself in autonomous mode
 #[derive(Debug, Args)]
@@ -111,7 +112,7 @@ fn print_summary(summary: &Summary) {
 
 /// Writes a line to standard error. Whoever reads it may have left, as in `2>&1 | head`; the car is driven on.
 fn say(text: &str) {
-    let _ = writeln!(std::io::stderr(), "{text}");
+    eprintln!("{text}");
 }
 
 /// Standard error: on a terminal the status stays in the last line, elsewhere it is written now and then.
@@ -147,7 +148,7 @@ impl Console for Screen {
 
     fn status(&self, text: &str) {
         if let Some(bar) = &self.bar {
-            bar.set_message(text.to_owned());
+            bar.set_message(escaped(text).into_owned());
             bar.tick();
             return;
         }

@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::main_job::job::Stages;
+use crate::text::escaped;
 
 /// Time between plain progress lines.
 const PLAIN_INTERVAL: Duration = Duration::from_secs(10);
@@ -23,7 +24,7 @@ pub struct ShareBar {
 impl ShareBar {
     /// For the work `what`, as in `driving on lake`.
     pub fn new(what: impl Into<String>) -> ShareBar {
-        let what = what.into();
+        let what = escaped(&what.into()).into_owned();
         let style = ProgressStyle::with_template("{prefix} [{bar:30}] {percent} %, {eta} left");
         let style = style.expect("the template is valid").progress_chars("=> ");
         let bar = std::io::stderr().is_terminal().then(|| ProgressBar::new(STEPS as u64).with_style(style));

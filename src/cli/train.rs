@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use clap::Args;
+use steersman_kernels::conv::ConvAlgorithm;
 
 use super::progress::Progress;
 use super::share_bar::Bars;
@@ -39,11 +40,14 @@ pub struct TrainArgs {
     /// Threads; 0 is one for each core
     #[arg(long, default_value_t = 0)]
     threads: usize,
+    /// How convolutions are computed: auto (the fastest for each shape) or im2col (the textbook way) [default: auto]
+    #[arg(long, value_name = "NAME")]
+    algorithm: Option<ConvAlgorithm>,
     /// Memory for decoded images, in MiB; what does not fit goes to a temporary file
     #[arg(long, default_value_t = 1024, value_name = "MIB")]
     cache: usize,
     /// Go on with a run that was stopped, as if it had never stopped
-    #[arg(long, value_name = "RUN", conflicts_with_all = ["recordings", "recipe", "overrides", "out", "seed", "cache"])]
+    #[arg(long, value_name = "RUN", conflicts_with_all = ["recordings", "recipe", "overrides", "out", "seed", "cache", "algorithm"])]
     resume: Option<PathBuf>,
     /// Without a recording: runs of the finished model on each track, of one lap
     #[arg(long, default_value_t = 1, conflicts_with_all = ["recordings", "resume"])]
@@ -90,7 +94,8 @@ pub fn run(args: TrainArgs) -> Result<()> {
             None => {
                 let recipe = recipe()?;
                 let out = args.out.unwrap_or_else(|| RunFolder::next_free(&recipe.name));
-                let request = JobRequest { recipe, out, seed: args.seed, cache_mib: args.cache, from };
+                let (seed, cache_mib, algorithm) = (args.seed, args.cache, args.algorithm);
+                let request = JobRequest { recipe, out, seed, cache_mib, from, algorithm };
                 pool.install(|| job.begin(request))
             }
         };
@@ -130,6 +135,7 @@ pub fn run(args: TrainArgs) -> Result<()> {
                 seed: args.seed,
                 cache_mib: args.cache,
                 from,
+                algorithm: args.algorithm,
             };
             let result = pool.install(|| training::train(request, &mut progress, &stop));
             (out, result)

@@ -140,6 +140,7 @@ pub fn run(
                 seed,
                 cache_mib: plan.cache_mib,
                 from: None,
+                algorithm: None,
             };
             let training = training::train(request, observer, stop)?;
             let options = DriveOptions { runs: plan.runs, ..Default::default() };

@@ -14,6 +14,8 @@ use crate::files::atomic_file;
 use crate::pilot::Pilot;
 use crate::recipe::Recipe;
 use crate::simulator::{DriveOptions, Track};
+use steersman_kernels::conv::ConvAlgorithm;
+
 use crate::training::{self, Observer, RunFolder, TrainRequest, TrainResult, TransferRequest};
 
 /// Where the main job keeps what it records.
@@ -106,6 +108,8 @@ pub struct JobRequest {
     pub cache_mib: usize,
     /// Weights to begin the first training with; rounds of DAgger begin anew.
     pub from: Option<TransferRequest>,
+    /// As in [`TrainRequest::algorithm`].
+    pub algorithm: Option<ConvAlgorithm>,
 }
 
 impl<'a> Job<'a> {
@@ -131,13 +135,13 @@ impl<'a> Job<'a> {
     ///
     /// As [`training_set::recordings`], [`training::train`] and [`test_on_track`]; [`Error::Interrupted`] after a stop.
     pub fn begin(&mut self, request: JobRequest) -> Result<MainJobResult> {
-        let JobRequest { recipe, out, seed, cache_mib, from } = request;
+        let JobRequest { recipe, out, seed, cache_mib, from, algorithm } = request;
         RunFolder::require_free(&out)?;
         for round in 1..=self.note.dagger_rounds {
             RunFolder::require_free(&dagger_folder(&out, 0, round)?)?;
         }
         let recordings = training_set(&self.scope.recordings, &self.scope.takes, self.stages, self.stop)?;
-        let training = self.train(TrainRequest { recordings, recipe, out, seed, cache_mib, from })?;
+        let training = self.train(TrainRequest { recordings, recipe, out, seed, cache_mib, from, algorithm })?;
         self.rest(training)
     }
 
@@ -192,6 +196,7 @@ impl<'a> Job<'a> {
             };
             dagger::recordings(&pilot, &self.scope.takes, &path.join("dagger"), round, &progress)?
         };
+        let algorithm = Some(info.conv_algorithm(&folder)?);
         let mut recordings = info.recordings;
         recordings.extend(recorded);
         self.note.round = round;
@@ -199,7 +204,8 @@ impl<'a> Job<'a> {
             self.folder = Some(out.clone());
             return training::resume(&out, self.observer, self.stop);
         }
-        self.train(TrainRequest { recordings, recipe, out, seed: info.seed, cache_mib: info.cache_mib, from: None })
+        let (seed, cache_mib) = (info.seed, info.cache_mib);
+        self.train(TrainRequest { recordings, recipe, out, seed, cache_mib, from: None, algorithm })
     }
 
     /// Whether `out` holds the run of this job's round on `recordings` already, begun before a stop.

@@ -5,7 +5,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use serde::{Deserialize, Serialize};
-use steersman_kernels::Isa;
+use steersman_kernels::conv::ConvAlgorithm;
+use steersman_kernels::{Backend, Isa};
 
 use super::checkpoint::{Progress, State};
 use super::data::Data;
@@ -42,6 +43,8 @@ pub struct TrainRequest {
     pub cache_mib: usize,
     /// A model to begin from instead of fresh weights.
     pub from: Option<TransferRequest>,
+    /// How convolutions are computed; `None` for [`ConvAlgorithm::of_environment`].
+    pub algorithm: Option<ConvAlgorithm>,
 }
 
 /// Whoever watches a run. All methods are called from the training thread.
@@ -86,6 +89,9 @@ pub struct TrainResult {
     pub seconds: f64,
     /// Training images a second while training, validation left out.
     pub images_per_second: f64,
+    /// How convolutions were computed, if not by the default algorithms: `im2col`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub algorithm: Option<String>,
     /// Over all tensors of the last model.
     pub weights_hash: String,
     /// Share of validation frames with a training frame of the same session within a second, in percent.
@@ -107,7 +113,8 @@ pub struct TrainResult {
 pub fn train(request: TrainRequest, observer: &mut dyn Observer, stop: &AtomicBool) -> Result<TrainResult> {
     let started = Instant::now();
     let profile = observer.wants_profile().then(Profile::start);
-    let TrainRequest { recordings, recipe, out, seed, cache_mib, from } = request;
+    let TrainRequest { recordings, recipe, out, seed, cache_mib, from, algorithm } = request;
+    let algorithm = algorithm.unwrap_or_else(ConvAlgorithm::of_environment);
     let start = from.as_ref().map(|from| Start::load(&from.model, from, &recipe, seed)).transpose()?;
     let data = Data::prepare(&recordings, &recipe, seed, cache_mib)?;
     let mut trained_on_held_out = held_out_tracks(&recordings)?;
@@ -122,6 +129,7 @@ pub fn train(request: TrainRequest, observer: &mut dyn Observer, stop: &AtomicBo
     let info = RunInfo {
         version: env!("CARGO_PKG_VERSION").into(),
         isa: Isa::best().name().into(),
+        algorithm: (algorithm != ConvAlgorithm::Auto).then(|| algorithm.to_string()),
         seed,
         recordings: recordings.iter().map(absolute).collect::<Result<_>>()?,
         cache_mib,
@@ -199,7 +207,7 @@ impl Session {
         start: Option<Start>,
         started: Instant,
     ) -> Result<Session> {
-        let mut network = recipe.network(Isa::best())?;
+        let mut network = recipe.network(Backend { isa: Isa::best(), conv: info.conv_algorithm(&folder)? })?;
         if let Some(start) = &start {
             network.freeze(&start.transfer.frozen)?;
         }
@@ -493,6 +501,7 @@ impl Session {
             val_images: self.validation.as_ref().map_or(0, Validation::images),
             seconds: progress.seconds,
             images_per_second: images as f64 / seconds,
+            algorithm: self.info.algorithm.clone(),
             weights_hash: weights_hash(&self.network, &self.state.parameters),
             leak_percent: self.leak_percent,
             trained_on_held_out: self.info.trained_on_held_out.clone(),

@@ -1,5 +1,7 @@
 //! What messages say of a file: problems of layers, and texts from the file that are safe to show.
 
+use crate::text::excerpt;
+
 /// Why a layer cannot be imported.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Problem {
@@ -29,12 +31,7 @@ const SHOWN_ENTRIES: usize = 20;
 
 /// A text from the file, fit for a message: short, and without characters that a terminal obeys.
 pub(super) fn shown(text: &str) -> String {
-    let mut chars = text.chars().filter(|c| !c.is_control());
-    let mut short: String = chars.by_ref().take(SHOWN_CHARS).collect();
-    if chars.next().is_some() {
-        short.push('…');
-    }
-    short
+    excerpt(text, SHOWN_CHARS)
 }
 
 /// Names from the file in one line.

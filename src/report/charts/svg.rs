@@ -3,6 +3,7 @@
 use std::fmt::Write as _;
 
 use crate::report::charts::palette::INK;
+use crate::text::escaped_lines;
 
 /// Fonts every system has one of.
 pub const FONT: &str = "system-ui, -apple-system, 'Segoe UI', 'DejaVu Sans', Arial, sans-serif";
@@ -133,18 +134,16 @@ fn number(value: f64) -> String {
     if text == "-0" { "0".into() } else { text.into() }
 }
 
-/// `text` with what XML would take for markup, or forbids, replaced.
+/// `text` with what XML would take for markup replaced, and what it forbids or a reader cannot see written out.
 pub fn escape(text: &str) -> String {
     let mut escaped = String::with_capacity(text.len());
-    for c in text.chars() {
+    for c in escaped_lines(text).chars() {
         match c {
             '&' => escaped.push_str("&amp;"),
             '<' => escaped.push_str("&lt;"),
             '>' => escaped.push_str("&gt;"),
             '"' => escaped.push_str("&quot;"),
             '\'' => escaped.push_str("&#39;"),
-            '\n' | '\t' => escaped.push(c),
-            c if c.is_control() || matches!(c, '\u{fffe}' | '\u{ffff}') => escaped.push('\u{fffd}'),
             c => escaped.push(c),
         }
     }
@@ -164,7 +163,7 @@ mod tests {
         let text = svg.finish();
         let document = roxmltree::Document::parse(&text).unwrap();
         let found = document.descendants().find(|node| node.has_tag_name(("http://www.w3.org/2000/svg", "text")));
-        assert_eq!(found.unwrap().text(), Some("a < b & \"c\" \u{fffd}\u{fffd}"));
+        assert_eq!(found.unwrap().text(), Some("a < b & \"c\" \\u{1}\\u{ffff}"));
         assert!(text.contains("width=\"0\" height=\"3\""), "{text}");
     }
 

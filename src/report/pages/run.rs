@@ -342,6 +342,7 @@ fn environment(page: &mut Page, info: &RunInfo, history: &[EpochRecord]) {
     let rows = [
         ["version".to_string(), format!("steersman {}", info.version)],
         ["vector code".into(), info.isa.clone()],
+        ["convolution algorithm".into(), info.algorithm.clone().unwrap_or_else(|| "auto".into())],
         ["seed".into(), info.seed.to_string()],
         ["recordings".into(), recordings.join(", ")],
         ["hash of the rows".into(), info.rows_hash.clone()],

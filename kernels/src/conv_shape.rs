@@ -49,23 +49,28 @@ impl ConvShape {
         (self.out_h() * self.out_w() * self.oc) as u64 * self.taps() as u64
     }
 
-    /// Elements of one input image.
-    pub(crate) fn x_len(&self) -> usize {
+    /// Elements of one input image, `c * h * w`.
+    pub fn x_len(&self) -> usize {
         self.c * self.h * self.w
     }
 
-    /// Elements of one output image.
-    pub(crate) fn y_len(&self) -> usize {
+    /// Elements of one output image, `oc * out_h * out_w`.
+    pub fn y_len(&self) -> usize {
         self.oc * self.out_pixels()
     }
 
-    /// Positions of one output channel.
-    pub(crate) fn out_pixels(&self) -> usize {
+    /// Elements of one output channel, `out_h * out_w`.
+    pub fn out_pixels(&self) -> usize {
         self.out_h() * self.out_w()
     }
 
-    /// Weights of one output channel.
-    pub(crate) fn taps(&self) -> usize {
+    /// Weights of one output channel, `c * kh * kw`.
+    pub fn taps(&self) -> usize {
         self.c * self.kh * self.kw
+    }
+
+    /// Whether any zeros surround the image.
+    pub fn is_padded(&self) -> bool {
+        self.pad_top + self.pad_bottom + self.pad_left + self.pad_right > 0
     }
 }

@@ -1,17 +1,22 @@
-//! Images as the direct kernels read them: padded, and with strided columns brought side by side.
+//! The layout of images for a sum over taps: padded, with the columns of each phase side by side.
 
-use super::ConvShape;
+use crate::conv_shape::ConvShape;
 use crate::simd::Simd;
 
-/// How the planes of an input image are laid out for a stride-1 sum over taps.
+/// How many images of `image` elements are copied at a time, within a budget of elements.
+pub(super) fn group_of(image: usize, budget: usize) -> usize {
+    (budget / image.max(1)).clamp(1, 8)
+}
+
+/// The layout of an input image for a sum over taps of stride 1.
 ///
-/// With stride `s`, the input row `oy s + ky` is row `oy + ky / s` among the rows that leave the remainder `ky % s`; the
-/// same holds for columns. Splitting the padded image into its `s x s` phases therefore turns any convolution into one
-/// of stride 1, with a table of tap offsets. A convolution of stride 1 without padding reads the image as it is.
+/// With stride `s`, the input row `oy * s + ky` is row `oy + ky / s` among the rows that leave the remainder `ky % s`. The same
+/// holds for columns. So splitting the padded image into its `s x s` phases turns any convolution into one of stride 1,
+/// with a table of tap offsets. A convolution of stride 1 without padding reads the image as it is.
 #[derive(Clone, Debug)]
 pub(crate) struct Layout {
     shape: ConvShape,
-    /// Phases in each direction; remainders that no tap has are left out.
+    /// Number of phases of rows and of columns. Phases that no tap reads are left out.
     phases: (usize, usize),
     /// Rows of a phase plane.
     pub rows: usize,
@@ -24,8 +29,7 @@ pub(crate) struct Layout {
 impl Layout {
     pub fn new(shape: ConvShape) -> Layout {
         let ConvShape { h, w, kh, kw, stride_h, stride_w, .. } = shape;
-        let padded = shape.pad_top + shape.pad_bottom + shape.pad_left + shape.pad_right > 0;
-        if stride_h == 1 && stride_w == 1 && !padded {
+        if stride_h == 1 && stride_w == 1 && !shape.is_padded() {
             return Layout { shape, phases: (1, 1), rows: h, pitch: w, copies: false };
         }
         Layout {
@@ -37,7 +41,7 @@ impl Layout {
         }
     }
 
-    /// Elements of one image.
+    /// Length of one image in this layout.
     pub fn image(&self) -> usize {
         self.shape.c * self.phases.0 * self.phases.1 * self.rows * self.pitch
     }
@@ -56,25 +60,26 @@ impl Layout {
         }
         taps
     }
+}
 
-    /// Copies images `[c][h][w]` into this layout; `to` is overwritten.
-    #[inline(always)]
-    pub fn copy<S: Simd>(&self, simd: S, x: &[f32], to: &mut [f32]) {
-        let ConvShape { c, h, w, stride_h, stride_w, pad_top, pad_left, .. } = self.shape;
-        let plane = self.rows * self.pitch;
+per_isa! {
+    /// Copies images `[c][h][w]` into the layout; `to` is overwritten.
+    pub fn copy<S>(simd: S, layout: &Layout, x: &[f32], to: &mut [f32]) {
+        let ConvShape { c, h, w, stride_h, stride_w, pad_top, pad_left, .. } = layout.shape;
+        let plane = layout.rows * layout.pitch;
         if h * w == 0 || plane == 0 {
             to.fill(0.0);
             return;
         }
-        debug_assert_eq!(x.len() / (c * h * w), to.len() / self.image());
-        let phases = self.phases.0 * self.phases.1;
+        debug_assert_eq!(x.len() / (c * h * w), to.len() / layout.image());
+        let phases = layout.phases.0 * layout.phases.1;
         for (x, planes) in x.chunks_exact(h * w).zip(to.chunks_exact_mut(phases * plane)) {
             for (phase, to) in planes.chunks_exact_mut(plane).enumerate() {
-                let (phase_y, phase_x) = (phase / self.phases.1, phase % self.phases.1);
+                let (phase_y, phase_x) = (phase / layout.phases.1, phase % layout.phases.1);
                 // The columns `q` of the phase with `0 <= q stride + phase - pad < w`.
-                let first = pad_left.saturating_sub(phase_x).div_ceil(stride_w).min(self.pitch);
-                let last = (w + pad_left).saturating_sub(phase_x).div_ceil(stride_w).clamp(first, self.pitch);
-                for (q, to) in to.chunks_exact_mut(self.pitch).enumerate() {
+                let first = pad_left.saturating_sub(phase_x).div_ceil(stride_w).min(layout.pitch);
+                let last = (w + pad_left).saturating_sub(phase_x).div_ceil(stride_w).clamp(first, layout.pitch);
+                for (q, to) in to.chunks_exact_mut(layout.pitch).enumerate() {
                     let row = q * stride_h + phase_y;
                     if row < pad_top || row - pad_top >= h || first == last {
                         to.fill(0.0);

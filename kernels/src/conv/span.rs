@@ -1,4 +1,4 @@
-//! Which output positions each vector holds.
+//! The output positions that each vector holds.
 
 /// One vector of output positions of an image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
