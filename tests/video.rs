@@ -46,7 +46,8 @@ fn a_video_can_be_read_again_with_its_pictures_times_and_places_to_jump_to() {
     let path = scratch.path().join("a.mp4");
     let mut video = VideoFile::create(&path, [96, 128], 10.0).unwrap();
     for k in 0..45 {
-        video.write(&RgbImage::from_fn(96, 128, |row, column| [(row + 3 * k) as u8, column as u8, 90])).unwrap();
+        let pixels = (0..96 * 128).flat_map(|at| [(at / 128 + 3 * k) as u8, (at % 128) as u8, 90]).collect();
+        video.write(&RgbImage { height: 96, width: 128, pixels }).unwrap();
     }
     assert!(!path.exists());
     let summary = video.finish().unwrap();

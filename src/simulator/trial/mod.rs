@@ -3,6 +3,7 @@
 pub mod closed_loop;
 pub mod drive;
 pub mod observer;
+mod pilot;
 pub mod run;
 pub mod statistics;
 pub mod trajectory;
