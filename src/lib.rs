@@ -42,21 +42,9 @@
 //! A recording is a folder with a `driving_log.csv`, or a donkeycar tub; `data/sample` is a very short one.
 //!
 //! ```
-//! use std::sync::atomic::AtomicBool;
+//! use steersman::observer::StopSignal;
 //! use steersman::recipe::Recipe;
-//! use steersman::training::{EpochRecord, Observer, TrainRequest, train};
-//!
-//! struct Printer;
-//!
-//! impl Observer for Printer {
-//!     fn notice(&mut self, text: &str) {
-//!         println!("{text}");
-//!     }
-//!     fn progress(&mut self, _epoch: u32, _images: usize, _of: usize, _loss: f64) {}
-//!     fn epoch(&mut self, record: &EpochRecord, of: u32) {
-//!         println!("epoch {} of {of}: loss {:.4}", record.epoch, record.train_loss);
-//!     }
-//! }
+//! use steersman::training::{TrainRequest, TrainingEvent, train};
 //!
 //! # let folder = tempfile::tempdir().unwrap();
 //! # let out = folder.path().join("run");
@@ -65,9 +53,19 @@
 //! # */
 //! // The recipe is the experiment: preprocessing, network, split, optimizer. A path ending in .toml names one of your own.
 //! let recipe = Recipe::find("lenet", &["epochs=2".into(), "batch=16".into()])?;
-//! let request = TrainRequest { recordings: vec!["data/sample".into()], recipe, out, seed: 1, cache_mib: 64, from: None, algorithm: None };
-//! let stop = AtomicBool::new(false); // set from elsewhere, it ends the run after the current batch
-//! let result = train(request, &mut Printer, &stop)?;
+//! let recordings = vec!["data/sample".into()];
+//! let (from, algorithm, profile) = (None, None, false);
+//! let request = TrainRequest { recordings, recipe, out, seed: 1, cache_mib: 64, from, algorithm, profile };
+//! let stop = StopSignal::default(); // requested from elsewhere, it ends the run after the current batch
+//! let mut observer = |event| {
+//!     match event {
+//!         TrainingEvent::Notice(text) => println!("{text}"),
+//!         TrainingEvent::Batch { .. } => {}
+//!         TrainingEvent::Epoch { record, of } => println!("epoch {} of {of}: loss {:.4}", record.epoch, record.train_loss),
+//!     }
+//!     Ok(())
+//! };
+//! let result = train(request, &mut observer, &stop)?;
 //! println!("{}: mean squared error {:?} on the validation side", result.model.display(), result.val_mse);
 //! # assert!(result.model.is_file() && result.epochs == 2);
 //! # Ok::<(), steersman::Error>(())
@@ -170,6 +168,8 @@ pub mod metrics;
 pub mod model_file;
 #[cfg(feature = "serve")]
 mod net;
+#[cfg(feature = "training")]
+pub mod observer;
 #[cfg(feature = "training")]
 pub mod picture;
 #[cfg(feature = "training")]

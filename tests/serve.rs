@@ -11,23 +11,15 @@ use std::time::Duration;
 use common::command::{error, json, steersman};
 use common::served::{Client, SIMULATOR, Served, command, random_model, sample_jpeg, telemetry};
 use serde_json::Value;
+use steersman::observer::Unobserved;
 use steersman::pilot::Pilot;
-use steersman::serve::client::{ClientOptions, ClientReport, Numbers, Observer, Pace, drive};
+use steersman::serve::client::{ClientOptions, ClientReport, Numbers, Pace, drive};
 use steersman::serve::protocol::DecimalMark;
 use steersman::simulator::trial::run::run;
 use steersman::simulator::{RunOptions, Speed, Track};
 
 /// Long enough for an answer that must not come. (Where the machine stands still, a wrong answer could be missed, not invented.)
 const QUIET: Duration = Duration::from_millis(400);
-
-struct Silent;
-
-impl Observer for Silent {
-    fn notice(&mut self, _: &str) {}
-    fn progress(&mut self, _: f64) -> bool {
-        true
-    }
-}
 
 /// A folder with `model`, a small network with random weights.
 fn folder_with_model() -> tempfile::TempDir {
@@ -52,7 +44,7 @@ fn lockstep(served: &Served) -> ClientOptions {
 }
 
 fn drive_lake(options: &ClientOptions) -> ClientReport {
-    drive(&Track::load("lake").unwrap(), options, &mut Silent).unwrap()
+    drive(&Track::load("lake").unwrap(), options, &mut Unobserved).unwrap()
 }
 
 fn count(value: &Value, name: &str) -> u64 {

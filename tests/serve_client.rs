@@ -9,21 +9,13 @@ use common::double::{Peer, start};
 use data_encoding::BASE64;
 use serde_json::Value;
 use steersman::Error;
+use steersman::observer::Unobserved;
 use steersman::picture::{RgbImage, decode::decode_rgb};
-use steersman::serve::client::{ClientOptions, ClientReport, Numbers, Observer, Pace, drive};
+use steersman::serve::client::{ClientOptions, ClientReport, Numbers, Pace, drive};
 use steersman::serve::protocol::DecimalMark;
 use steersman::simulator::car::speed::SpeedController;
 use steersman::simulator::trial::run::run;
 use steersman::simulator::{DriveState, Driver, RgbFrame, RunOptions, Speed, Track};
-
-struct Silent;
-
-impl Observer for Silent {
-    fn notice(&mut self, _: &str) {}
-    fn progress(&mut self, _: f64) -> bool {
-        true
-    }
-}
 
 /// In lockstep with a server on `port`, for `frames` replies.
 fn lockstep(port: u16, frames: u64) -> ClientOptions {
@@ -37,7 +29,7 @@ fn lockstep(port: u16, frames: u64) -> ClientOptions {
 }
 
 fn drive_lake(options: &ClientOptions) -> ClientReport {
-    drive(&Track::load("lake").unwrap(), options, &mut Silent).unwrap()
+    drive(&Track::load("lake").unwrap(), options, &mut Unobserved).unwrap()
 }
 
 /// The fields of a telemetry.
@@ -373,7 +365,7 @@ fn no_server_and_a_server_without_a_word_are_errors_with_a_remedy() {
         Err(Error::Usage(message)) => message,
         other => panic!("{other:?}"),
     };
-    let nobody = message(drive(&track, &impatient(port), &mut Silent));
+    let nobody = message(drive(&track, &impatient(port), &mut Unobserved));
     assert!(nobody.contains(&format!("127.0.0.1:{port}")) && nobody.contains("steersman serve"), "{nobody}");
 
     let (port, server) = start(|listener| {
@@ -381,13 +373,13 @@ fn no_server_and_a_server_without_a_word_are_errors_with_a_remedy() {
         while peer.next().is_some_and(|text| text != "41") {}
         peer.stream().shutdown(Shutdown::Both)
     });
-    let silent = message(drive(&track, &impatient(port), &mut Silent));
+    let silent = message(drive(&track, &impatient(port), &mut Unobserved));
     assert!(silent.contains("no reply to telemetry"), "{silent}");
     let _ = server.join().unwrap();
 
     // Closes every connection at once; its thread ends with the test.
     let (port, _) = start(|listener| listener.incoming().for_each(drop));
-    let closing = message(drive(&track, &impatient(port), &mut Silent));
+    let closing = message(drive(&track, &impatient(port), &mut Unobserved));
     assert!(closing.contains("steersman serve"), "{closing}");
 }
 
@@ -402,6 +394,6 @@ fn impossible_options_are_refused_before_anything_is_connected() {
         ClientOptions { scene_change_s: Some(f64::NAN), ..ClientOptions::default() },
         ClientOptions { patience_s: 0.0, ..ClientOptions::default() },
     ] {
-        assert!(matches!(drive(&track, &options, &mut Silent), Err(Error::Usage(_))), "{options:?}");
+        assert!(matches!(drive(&track, &options, &mut Unobserved), Err(Error::Usage(_))), "{options:?}");
     }
 }

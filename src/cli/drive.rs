@@ -1,7 +1,6 @@
 //! `steersman drive`: closed-loop driving in the simulator.
 
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicBool, Ordering};
 
 use clap::Args;
 use serde::Serialize;
@@ -14,6 +13,7 @@ use crate::error::{Error, Result};
 use crate::files::new_folder::NewFolder;
 use crate::live::messages::Hello;
 use crate::live::{DEFAULT_PORT, Live, Watch};
+use crate::observer::StopSignal;
 use crate::pilot::Pilot;
 use crate::report::charts::map;
 use crate::report::video::drive::DriveVideo;
@@ -217,16 +217,11 @@ impl Wheel {
         track: &Track,
         options: &DriveOptions,
         args: &DriveArgs,
-        stop: &AtomicBool,
+        stop: &StopSignal,
     ) -> Result<()> {
-        let bar = ShareBar::new("filming");
-        let mut progress = |share| {
-            bar.set(share);
-            !stop.load(Ordering::Relaxed)
-        };
+        let mut bar = ShareBar::new("filming", stop);
         let mut driver = self.driver();
-        let (summary, stopped) =
-            video.film(track, driver.as_mut(), &options.of_run(false), options.seed, &mut progress)?;
+        let (summary, stopped) = video.film(track, driver.as_mut(), &options.of_run(false), options.seed, &mut bar)?;
         drop(bar);
         if let Some(path) = &args.video {
             tell_video(path, &summary);
@@ -240,19 +235,15 @@ impl Wheel {
         options: &DriveOptions,
         name: &str,
         live: Option<&Live>,
-        stop: &AtomicBool,
+        stop: &StopSignal,
     ) -> Result<DriveResult> {
         let new_driver = || Ok(self.driver());
         let mut result = if let Some(live) = live {
             let pilot = if let Wheel::Model(pilot) = self { Some(&**pilot) } else { None };
             drive_observed(track, new_driver, options, &mut Watch::new(live, name, pilot, options.runs, stop))?
         } else {
-            let bar = ShareBar::new(format!("{name} on {}", track.name()));
-            let progress = |share| {
-                bar.set(share);
-                !stop.load(Ordering::Relaxed)
-            };
-            drive(track, new_driver, options, &progress)?
+            let mut bar = ShareBar::new(format!("{name} on {}", track.name()), stop);
+            drive(track, new_driver, options, &mut bar)?
         };
         if let Wheel::Model(pilot) = self {
             result.summary.trained_on_held_out = pilot.trained_on_held_out().to_vec();

@@ -4,14 +4,14 @@ use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
 
-use super::progress::Progress;
-use super::share_bar::Bars;
+use super::progress::JobDisplay;
 use super::{RecipeArgs, or_dash, pool, print_json, refuse_existing, stop_on_ctrl_c};
 use crate::dataset::held_out::{self, trained_on_held_out};
 use crate::error::{Error, Result};
-use crate::main_job::experiment::{self, Plan, Subject, Trial, takes, write_csv};
+use crate::main_job::experiment::{self, ExperimentEvent, Plan, Subject, Trial, takes, write_csv};
 use crate::main_job::job::{RECORDINGS, training_set};
 use crate::main_job::training_set::RANDOM_TRACKS;
+use crate::observer::Observer;
 use crate::simulator::Track;
 
 /// Compare splits or colour spaces: what the validation loss promises beside what the drive delivers
@@ -87,11 +87,14 @@ pub fn run(args: ExperimentArgs) -> Result<()> {
         Track::load(track)?;
     }
     let stop = stop_on_ctrl_c()?;
-    let (pool, bars, mut progress) = (pool(args.threads)?, Bars, Progress::new());
+    let (pool, mut display) = (pool(args.threads)?, JobDisplay::new(&stop));
     // A file that cannot be written is told before hours are spent.
     let out = new_csv(args.out, args.subject)?;
     let recordings = match args.recordings.is_empty() {
-        true => pool.install(|| training_set(RECORDINGS.as_ref(), &takes(args.random_tracks as usize), &bars, &stop)),
+        true => {
+            let takes = takes(args.random_tracks as usize);
+            pool.install(|| training_set(RECORDINGS.as_ref(), &takes, &mut display, &stop))
+        }
         false => Ok(args.recordings),
     };
     let recordings = recordings.inspect_err(|_| drop(std::fs::remove_file(&out)))?;
@@ -101,11 +104,14 @@ pub fn run(args: ExperimentArgs) -> Result<()> {
     };
     let plan = Plan { subject, recipe, seeds, recordings, tracks, runs, cache_mib: args.cache };
     let mut done = Vec::new();
-    let mut told = |trial: &Trial| {
-        done.push(trial.clone());
-        write_csv(&out, &done)
+    let mut observer = |event| match event {
+        ExperimentEvent::Job(event) => display.observe(event),
+        ExperimentEvent::Trial(trial) => {
+            done.push(trial);
+            write_csv(&out, &done)
+        }
     };
-    let result = pool.install(|| experiment::run(&plan, &mut progress, &bars, &stop, &mut told)).map(drop);
+    let result = pool.install(|| experiment::run(&plan, &mut observer, &stop)).map(drop);
     // After a stop or an error too, what is done is shown and kept.
     if done.is_empty() {
         std::fs::remove_file(&out).map_err(Error::io(&out))?;

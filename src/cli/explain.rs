@@ -1,7 +1,6 @@
 //! `steersman explain`: what a model looks at.
 
 use std::path::PathBuf;
-use std::sync::atomic::Ordering;
 
 use clap::Args;
 use serde::Serialize;
@@ -57,12 +56,8 @@ pub fn run(args: ExplainArgs) -> Result<()> {
         None => Footage::of_paths(&args.inputs)?,
     };
     let stop = stop_on_ctrl_c()?;
-    let bar = ShareBar::new("changing pictures");
-    let progress = |share| {
-        bar.set(share);
-        !stop.load(Ordering::Relaxed)
-    };
-    let (found, steering) = pool(args.threads)?.install(|| examine(&pilot, &footage, &progress))?;
+    let mut bar = ShareBar::new("changing pictures", &stop);
+    let (found, steering) = pool(args.threads)?.install(|| examine(&pilot, &footage, &mut bar))?;
     drop(bar);
     let exhibits = exhibits(&pilot, &footage, &steering)?;
     let title = format!("{} on {}", args.model.display(), what(&args));

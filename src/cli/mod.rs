@@ -38,8 +38,6 @@ mod video;
 use std::io::{ErrorKind, Write};
 use std::path::Path;
 use std::process::ExitCode;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use clap::{Args, Parser, Subcommand};
@@ -47,6 +45,7 @@ use serde::Serialize;
 
 use crate::error::{Error, Result};
 use crate::model_file::Model;
+use crate::observer::StopSignal;
 use crate::recipe::Recipe;
 use crate::text::{escaped_json, escaped_lines};
 
@@ -158,12 +157,12 @@ fn pool(threads: usize) -> Result<rayon::ThreadPool> {
     })
 }
 
-/// A flag that Ctrl-C sets; the second Ctrl-C ends the process at once.
-fn stop_on_ctrl_c() -> Result<Arc<AtomicBool>> {
-    let stop = Arc::new(AtomicBool::new(false));
-    let flag = stop.clone();
+/// A signal that Ctrl-C gives; the second Ctrl-C ends the process at once.
+fn stop_on_ctrl_c() -> Result<StopSignal> {
+    let stop = StopSignal::default();
+    let signal = stop.clone();
     let handler = move || {
-        if flag.swap(true, Ordering::Relaxed) {
+        if signal.request() {
             std::process::exit(130);
         }
     };

@@ -1,7 +1,6 @@
 //! `steersman record`: the expert drives, or a person, and the cameras watch.
 
 use std::path::{Path, PathBuf};
-use std::sync::atomic::Ordering;
 
 use clap::{Args, ValueEnum};
 
@@ -103,12 +102,8 @@ pub fn run(args: RecordArgs) -> Result<()> {
         return drive_by_hand(&args, &track, &options);
     }
     let stop = stop_on_ctrl_c()?;
-    let bar = ShareBar::new(format!("recording {}", track.name()));
-    let progress = |share| {
-        bar.set(share);
-        !stop.load(Ordering::Relaxed)
-    };
-    let info = pool(args.threads)?.install(|| record(&track, &options, &args.out, &progress))?;
+    let mut bar = ShareBar::new(format!("recording {}", track.name()), &stop);
+    let info = pool(args.threads)?.install(|| record(&track, &options, &args.out, &mut bar))?;
     drop(bar);
     if args.json {
         return print_json(&info);

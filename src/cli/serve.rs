@@ -3,7 +3,6 @@
 use std::io::IsTerminal;
 use std::net::{IpAddr, SocketAddr};
 use std::path::PathBuf;
-use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
 use clap::Args;
@@ -11,8 +10,9 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use super::{or_dash, print_json, stop_on_ctrl_c};
 use crate::error::{Error, Result};
+use crate::observer::Observer;
 use crate::pilot::Pilot;
-use crate::serve::{Console, HelmOptions, Server, ServerOptions, Summary, protocol};
+use crate::serve::{HelmOptions, ServeEvent, Server, ServerOptions, Summary, protocol};
 use crate::text::escaped;
 
 /// Drive Udacity's simulator with a model; it connects by itself in autonomous mode
@@ -77,8 +77,8 @@ pub fn run(args: ServeArgs) -> Result<()> {
     if !args.host.is_loopback() {
         say(&format!("note: whoever reaches {address} can connect; there is no password"));
     }
-    let screen = Screen::new();
-    let summary = server.run(pilot, &screen, &stop)?;
+    let mut screen = Screen::new();
+    let summary = server.run(pilot, &mut screen, &stop)?;
     screen.close();
     if args.json {
         return print_json(&summary);
@@ -118,7 +118,7 @@ fn say(text: &str) {
 /// Standard error: on a terminal the status stays in the last line, elsewhere it is written now and then.
 struct Screen {
     bar: Option<ProgressBar>,
-    last_plain: Mutex<Option<Instant>>,
+    last_plain: Option<Instant>,
 }
 
 impl Screen {
@@ -128,7 +128,7 @@ impl Screen {
     fn new() -> Screen {
         let style = ProgressStyle::with_template("{msg}").expect("the template is valid");
         let bar = std::io::stderr().is_terminal().then(|| ProgressBar::new_spinner().with_style(style));
-        Screen { bar, last_plain: Mutex::new(None) }
+        Screen { bar, last_plain: None }
     }
 
     fn close(&self) {
@@ -138,7 +138,17 @@ impl Screen {
     }
 }
 
-impl Console for Screen {
+impl Observer<ServeEvent> for Screen {
+    fn observe(&mut self, event: ServeEvent) -> Result<()> {
+        match event {
+            ServeEvent::Line(text) => self.line(&text),
+            ServeEvent::Status(text) => self.status(&text),
+        }
+        Ok(())
+    }
+}
+
+impl Screen {
     fn line(&self, text: &str) {
         match &self.bar {
             Some(bar) => bar.suspend(|| say(text)),
@@ -146,16 +156,14 @@ impl Console for Screen {
         }
     }
 
-    fn status(&self, text: &str) {
+    fn status(&mut self, text: &str) {
         if let Some(bar) = &self.bar {
             bar.set_message(escaped(text).into_owned());
             bar.tick();
             return;
         }
-        // A thread that panicked while printing is no reason to lose the line.
-        let mut last = self.last_plain.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
-        if last.is_none_or(|last| last.elapsed() >= Self::PLAIN_INTERVAL) {
-            *last = Some(Instant::now());
+        if self.last_plain.is_none_or(|last| last.elapsed() >= Self::PLAIN_INTERVAL) {
+            self.last_plain = Some(Instant::now());
             say(text);
         }
     }

@@ -10,7 +10,7 @@ use image::{ImageFormat, RgbImage};
 use serde::Serialize;
 
 use super::{print, print_json};
-use crate::dataset::{self, Camera};
+use crate::dataset::{self, View};
 use crate::error::{Error, Result};
 use crate::files::new_folder::NewFolder;
 use crate::picture::{self, decode::decode_rgb};
@@ -147,7 +147,7 @@ fn save(sheet: &RgbImage, path: &Path) -> Result<()> {
 fn pictures(path: &Path, most: usize) -> Result<Vec<RgbImage>> {
     let recording = dataset::load(path)?;
     let rows: Vec<PathBuf> =
-        (0..recording.rows.len()).filter_map(|row| recording.image_path(row, Camera::Centre)).collect();
+        (0..recording.rows.len()).filter_map(|row| recording.image_path(row, View::Centre)).collect();
     if rows.is_empty() {
         return Err(Error::data(path, "no row has a picture of the centre camera; name another recording"));
     }

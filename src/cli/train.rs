@@ -6,8 +6,7 @@ use std::time::Instant;
 use clap::Args;
 use steersman_kernels::conv::ConvAlgorithm;
 
-use super::progress::Progress;
-use super::share_bar::Bars;
+use super::progress::{JobDisplay, TrainingDisplay};
 use super::{RecipeArgs, or_dash, pool, print_json, stop_on_ctrl_c};
 use crate::dataset::held_out::{self, trained_on_held_out};
 use crate::error::{Error, Result};
@@ -75,7 +74,6 @@ pub fn run(args: TrainArgs) -> Result<()> {
     }
     let stop = stop_on_ctrl_c()?;
     let pool = pool(args.threads)?;
-    let mut progress = Progress::new().with_profile(args.profile);
     let from = args.from.map(|model| TransferRequest { model, freeze: args.freeze });
     let recipe = || match &from {
         Some(from) => args.recipe.find_or_of(&from.model),
@@ -87,8 +85,8 @@ pub fn run(args: TrainArgs) -> Result<()> {
         None => None,
     };
     if let Some(note) = note {
-        let bars = Bars;
-        let mut job = Job::new(Scope::default(), note, &mut progress, &bars, &stop);
+        let mut display = JobDisplay::new(&stop);
+        let mut job = Job::new(Scope::default(), note, &mut display, &stop).with_profile(args.profile);
         let result = match args.resume {
             Some(folder) => pool.install(|| job.go_on(&folder)),
             None => {
@@ -116,9 +114,10 @@ pub fn run(args: TrainArgs) -> Result<()> {
         );
         return Ok(());
     }
+    let mut display = TrainingDisplay::new();
     let (folder, result) = match args.resume {
         Some(folder) => {
-            let result = pool.install(|| training::resume(&folder, &mut progress, &stop));
+            let result = pool.install(|| training::resume(&folder, args.profile, &mut display, &stop));
             (folder, result)
         }
         None => {
@@ -135,9 +134,10 @@ pub fn run(args: TrainArgs) -> Result<()> {
                 seed: args.seed,
                 cache_mib: args.cache,
                 from,
+                profile: args.profile,
                 algorithm: args.algorithm,
             };
-            let result = pool.install(|| training::train(request, &mut progress, &stop));
+            let result = pool.install(|| training::train(request, &mut display, &stop));
             (out, result)
         }
     };

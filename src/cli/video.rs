@@ -1,7 +1,6 @@
 //! `steersman video`: recordings and drives as video files.
 
 use std::path::{Path, PathBuf};
-use std::sync::atomic::Ordering;
 
 use clap::Args;
 use serde::Serialize;
@@ -68,16 +67,12 @@ pub fn run(args: VideoArgs) -> Result<()> {
         return Err(Error::Usage(format!("{} {message}", args.source.display())));
     }
     let stop = stop_on_ctrl_c()?;
-    let bar = ShareBar::new("filming");
-    let mut progress = |share| {
-        bar.set(share);
-        !stop.load(Ordering::Relaxed)
-    };
+    let mut bar = ShareBar::new("filming", &stop);
     let (summary, stopped) = if is_drive {
         let choice = RunChoice { seed: args.seed, assisted: args.assisted };
-        replay::film(&args.source, choice, &args.file, onlooker, args.fps, &mut progress)?
+        replay::film(&args.source, choice, &args.file, onlooker, args.fps, &mut bar)?
     } else {
-        recording::film(&args.source, &args.file, onlooker, args.fps, &mut progress)?
+        recording::film(&args.source, &args.file, onlooker, args.fps, &mut bar)?
     };
     drop(bar);
     if args.json {

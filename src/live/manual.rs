@@ -2,7 +2,6 @@
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::time::Instant;
 
@@ -15,6 +14,7 @@ use super::messages::{Hello, Manual, State};
 use super::server::Live;
 use crate::error::{Error, Result};
 use crate::files::new_folder::NewFolder;
+use crate::observer::StopSignal;
 use crate::simulator::camera::eye::Eye;
 use crate::simulator::car::dynamics::{Controls, MPS_PER_MPH, STEP_S, STEPS_PER_S};
 use crate::simulator::recorder::record::{RecordingInfo, Sample};
@@ -74,12 +74,12 @@ impl<'a> ManualDrive<'a> {
         self.live.url()
     }
 
-    /// Lets pages drive until one finishes or `stop` is set, and gives the recording its name.
+    /// Lets pages drive until one finishes or `stop` is requested, and gives the recording its name.
     ///
     /// # Errors
     ///
     /// If something cannot be written. What was recorded until then is kept, and the message says where.
-    pub fn run(self, stop: &AtomicBool) -> Result<ManualSummary> {
+    pub fn run(self, stop: &StopSignal) -> Result<ManualSummary> {
         let ManualDrive { track, options, out, folder, writer, live } = self;
         let (sender, samples) = channel();
         let mut session = Session::new(track, options, &live, sender);
@@ -87,7 +87,7 @@ impl<'a> ManualDrive<'a> {
             let writing = scope.spawn(move || write(writer, &samples));
             let mut clock = Clock::start(Instant::now());
             let (mut steps, mut drive) = (0u64, Ok(true));
-            while matches!(drive, Ok(true)) && !stop.load(Ordering::Relaxed) && !writing.is_finished() {
+            while matches!(drive, Ok(true)) && !stop.requested() && !writing.is_finished() {
                 std::thread::sleep(clock.until(steps as f64 * STEP_S, Instant::now()));
                 // A fault here must not take with it what was recorded, nor leave the writer waiting.
                 let step = catch_unwind(AssertUnwindSafe(|| session.step()));

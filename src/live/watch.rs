@@ -1,17 +1,17 @@
 //! A closed-loop drive, shown in real time.
 
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use super::clock::Clock;
 use super::messages::State;
 use super::server::Live;
-use crate::error::{Error, Result};
+use crate::error::Result;
+use crate::observer::{Observer, StopSignal};
 use crate::picture::RgbImage;
 use crate::pilot::Pilot;
 use crate::report::explain::saliency::Saliency;
 use crate::simulator::camera::jpeg;
-use crate::simulator::{DriveFrame, DriveObserver, HEIGHT, RunOptions, WIDTH};
+use crate::simulator::{DriveEvent, DriveFrame, HEIGHT, RunOptions, WIDTH};
 
 /// How soon a wait notices that it is to end.
 const TICK: Duration = Duration::from_millis(50);
@@ -19,7 +19,7 @@ const TICK: Duration = Duration::from_millis(50);
 /// Shows the runs of a drive on a page, and holds them to the clock.
 pub struct Watch<'a> {
     live: &'a Live,
-    stop: &'a AtomicBool,
+    stop: &'a StopSignal,
     driver: &'a str,
     /// Who steers once more, to see what excites the network. Never the driver itself, whose drive must not change.
     saliency: Option<(Pilot, Saliency)>,
@@ -35,8 +35,8 @@ pub struct Watch<'a> {
 }
 
 impl<'a> Watch<'a> {
-    /// Shows `runs` seeds of `driver` on `live` until `stop` is set. `pilot` is the model at the wheel, if one is.
-    pub fn new(live: &'a Live, driver: &'a str, pilot: Option<&Pilot>, runs: usize, stop: &'a AtomicBool) -> Watch<'a> {
+    /// Shows `runs` seeds of `driver` on `live` until `stop` is requested. `pilot` is the model at the wheel, if one is.
+    pub fn new(live: &'a Live, driver: &'a str, pilot: Option<&Pilot>, runs: usize, stop: &'a StopSignal) -> Watch<'a> {
         // A network without a convolution has no saliency to show.
         let saliency = pilot.and_then(|pilot| Some((pilot.clone(), Saliency::new(pilot.network()).ok()?)));
         Watch {
@@ -59,9 +59,7 @@ impl<'a> Watch<'a> {
     fn wait(&mut self, time_s: f64) -> Result<()> {
         let clock = self.clock.get_or_insert_with(|| Clock::start(Instant::now()));
         loop {
-            if self.stop.load(Ordering::Relaxed) {
-                return Err(Error::Interrupted);
-            }
+            self.stop.check()?;
             let left = clock.until(time_s, Instant::now());
             if left.is_zero() {
                 return Ok(());
@@ -71,7 +69,17 @@ impl<'a> Watch<'a> {
     }
 }
 
-impl DriveObserver for Watch<'_> {
+impl<'e> Observer<DriveEvent<'e>> for Watch<'_> {
+    fn observe(&mut self, event: DriveEvent<'e>) -> Result<()> {
+        match event {
+            DriveEvent::Begin { seed, options } => self.begin(seed, options),
+            DriveEvent::Frame(frame) => return self.frame(frame),
+        }
+        Ok(())
+    }
+}
+
+impl Watch<'_> {
     fn begin(&mut self, seed: u64, options: &RunOptions) {
         self.begun += usize::from(self.seed != Some(seed));
         (self.seed, self.clock, self.way) = (Some(seed), None, self.way + 1);

@@ -2,21 +2,21 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::AtomicBool;
 
 use serde::Serialize;
 use serde_json::Value;
 
-use super::job::{Stages, test_on_tracks};
+use super::job::{JobEvent, test_on_tracks};
 use super::{TrackResult, training_set};
 use crate::dataset::colour::Colour;
 use crate::dataset::split::SplitMode;
 use crate::error::{Error, Result};
 use crate::files::atomic_file;
+use crate::observer::{Observer, StopSignal};
 use crate::pilot::Pilot;
 use crate::recipe::Recipe;
 use crate::simulator::DriveOptions;
-use crate::training::{self, Observer, TrainRequest};
+use crate::training::{self, TrainRequest};
 
 /// What is varied.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -101,6 +101,15 @@ pub struct Trial {
     pub trained_on_held_out: Vec<String>,
 }
 
+/// What happens in an experiment.
+#[derive(Clone, Debug, PartialEq)]
+pub enum ExperimentEvent {
+    /// Something happens in the training or the drives of a trial.
+    Job(JobEvent),
+    /// A trial is done.
+    Trial(Trial),
+}
+
 /// Recordings of the main job's set that an experiment trains on: both training tracks, and of the random tracks as many
 /// as `random_tracks`.
 pub fn takes(random_tracks: usize) -> Vec<training_set::Take> {
@@ -113,18 +122,15 @@ pub fn takes(random_tracks: usize) -> Vec<training_set::Take> {
     takes
 }
 
-/// Trains and drives every variant of `plan` with every seed. `told` hears of each trial when it is done. Call it inside a
-/// rayon pool; runs are kept in a temporary folder only.
+/// Trains and drives every variant of `plan` with every seed. Call it inside a rayon pool; runs are kept in a temporary folder only.
 ///
 /// # Errors
 ///
-/// As [`training::train`] and [`test_on_tracks`]; [`Error::Interrupted`] if `stop` is set.
+/// As [`training::train`] and [`test_on_tracks`]; [`Error::Interrupted`] if `stop` is requested.
 pub fn run(
     plan: &Plan,
-    observer: &mut (dyn Observer + Send),
-    stages: &dyn Stages,
-    stop: &AtomicBool,
-    told: &mut (dyn FnMut(&Trial) -> Result<()> + Send),
+    observer: &mut (dyn Observer<ExperimentEvent> + Send),
+    stop: &StopSignal,
 ) -> Result<Vec<Trial>> {
     let folder = tempfile::tempdir().map_err(Error::io(std::env::temp_dir()))?;
     let mut trials = Vec::new();
@@ -132,7 +138,7 @@ pub fn run(
         // Not every colour space fits every network; say so before minutes are spent.
         recipe.network(steersman_kernels::Isa::best())?;
         for seed in 1..=plan.seeds {
-            stages.notice(&format!("{variant}, seed {seed}"));
+            observer.observe(ExperimentEvent::Job(JobEvent::Notice(format!("{variant}, seed {seed}"))))?;
             let request = TrainRequest {
                 recordings: plan.recordings.clone(),
                 recipe: recipe.clone(),
@@ -140,12 +146,14 @@ pub fn run(
                 seed,
                 cache_mib: plan.cache_mib,
                 from: None,
+                profile: false,
                 algorithm: None,
             };
-            let training = training::train(request, observer, stop)?;
+            let mut of_job = |event| observer.observe(ExperimentEvent::Job(event));
+            let training = training::train(request, &mut |event| of_job(JobEvent::Training(event)), stop)?;
             let options = DriveOptions { runs: plan.runs, ..Default::default() };
             let pilot = Pilot::load(&training.model)?;
-            let drives = test_on_tracks(&pilot, &plan.tracks, &options, None, stages, stop)?;
+            let drives = test_on_tracks(&pilot, &plan.tracks, &options, None, &mut of_job, stop)?;
             let mean = |of: &dyn Fn(&TrackResult) -> f64| drives.iter().map(of).sum::<f64>() / drives.len() as f64;
             let trial = Trial {
                 variant: variant.into(),
@@ -160,7 +168,7 @@ pub fn run(
                 cte_mean_m: mean(&|d| d.drive.cte_mean_m),
                 trained_on_held_out: training.trained_on_held_out,
             };
-            told(&trial)?;
+            observer.observe(ExperimentEvent::Trial(trial.clone()))?;
             trials.push(trial);
         }
     }

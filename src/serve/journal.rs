@@ -6,7 +6,9 @@ use std::time::{Duration, Instant};
 
 use serde::Serialize;
 
-use super::server::Console;
+use super::server::ServeEvent;
+use crate::observer::Observer;
+use crate::{Error, Result};
 
 /// Each event may be reported once in this time on average.
 const INTERVAL: Duration = Duration::from_secs(5);
@@ -119,9 +121,15 @@ impl Event {
     }
 }
 
+/// Whoever is told, and the error with which it ended that.
+struct Observed<'a> {
+    observer: &'a mut (dyn Observer<ServeEvent> + Send),
+    error: Option<Error>,
+}
+
 /// The log.
 pub struct Journal<'a> {
-    console: &'a dyn Console,
+    observer: Mutex<Observed<'a>>,
     check: bool,
     entries: Mutex<BTreeMap<Event, Entry>>,
 }
@@ -151,9 +159,35 @@ impl Entry {
 }
 
 impl<'a> Journal<'a> {
-    /// A log that is shown on `console`; with `check` every step and message as well.
-    pub fn new(console: &'a dyn Console, check: bool) -> Journal<'a> {
-        Journal { console, check, entries: Mutex::default() }
+    /// A log that `observer` is told; with `check` every step and message as well.
+    pub fn new(observer: &'a mut (dyn Observer<ServeEvent> + Send), check: bool) -> Journal<'a> {
+        Journal { observer: Mutex::new(Observed { observer, error: None }), check, entries: Mutex::default() }
+    }
+
+    fn tell(&self, event: ServeEvent) {
+        let mut observed = self.observer.lock().unwrap_or_else(PoisonError::into_inner);
+        if observed.error.is_none() {
+            observed.error = observed.observer.observe(event).err();
+        }
+    }
+
+    /// Tells how it goes.
+    pub fn status(&self, text: String) {
+        self.tell(ServeEvent::Status(text));
+    }
+
+    /// Whether the observer returned an error, and is told nothing more.
+    pub fn failed(&self) -> bool {
+        self.observer.lock().unwrap_or_else(PoisonError::into_inner).error.is_some()
+    }
+
+    /// Ends the log.
+    ///
+    /// # Errors
+    ///
+    /// The first that the observer returned.
+    pub fn into_result(self) -> Result<()> {
+        self.observer.into_inner().unwrap_or_else(PoisonError::into_inner).error.map_or(Ok(()), Err)
     }
 
     /// Reports `event`: `detail`, and the remedy. Not more often than every few seconds for each kind of event.
@@ -172,15 +206,15 @@ impl<'a> Journal<'a> {
             more => format!(" ({more} more like this before)"),
         };
         match event.remedy() {
-            Some(remedy) => self.console.line(&format!("{detail}: {remedy}{more}")),
-            None => self.console.line(&format!("{detail}{more}")),
+            Some(remedy) => self.tell(ServeEvent::Line(format!("{detail}: {remedy}{more}"))),
+            None => self.tell(ServeEvent::Line(format!("{detail}{more}"))),
         }
     }
 
     /// Shows a step of a connection, if every step is wanted.
     pub fn step(&self, text: std::fmt::Arguments) {
         if self.check {
-            self.console.line(&text.to_string());
+            self.tell(ServeEvent::Line(text.to_string()));
         }
     }
 
@@ -200,32 +234,41 @@ impl<'a> Journal<'a> {
 mod tests {
     use super::*;
 
-    #[derive(Default)]
-    struct Lines(Mutex<Vec<String>>);
-
-    impl Console for Lines {
-        fn line(&self, text: &str) {
-            self.0.lock().unwrap().push(text.into());
-        }
-
-        fn status(&self, _: &str) {}
-    }
-
     #[test]
     fn a_flood_of_one_event_is_a_few_lines_and_hides_no_other() {
-        let lines = Lines::default();
-        let journal = Journal::new(&lines, false);
+        let mut lines = Vec::new();
+        let mut observer = |event| {
+            match event {
+                ServeEvent::Line(text) => lines.push(text),
+                ServeEvent::Status(_) => {}
+            }
+            Ok(())
+        };
+        let journal = Journal::new(&mut observer, false);
         for k in 0..1000 {
             journal.report(Event::UnreadableImage, format_args!("picture {k}"));
         }
         journal.report(Event::NoSpeed, format_args!("telemetry without a speed"));
         journal.step(format_args!("not shown"));
-        let lines = lines.0.lock().unwrap();
+        assert_eq!(journal.counts()[&Event::UnreadableImage], 1000);
+        assert!(!journal.failed() && journal.into_result().is_ok());
         assert_eq!(lines.len(), BURST as usize + 1, "{lines:?}");
         let (mut entry, now) = (Entry::default(), Instant::now());
         let shown = (0..6000).filter(|ms| entry.admit(now + Duration::from_millis(*ms * 10))).count();
         assert_eq!(shown as u32, BURST + 11, "in a minute");
         assert!(lines[0].starts_with("picture 0: the throttle is cut"), "{lines:?}");
-        assert_eq!(journal.counts()[&Event::UnreadableImage], 1000);
+    }
+
+    #[test]
+    fn an_observer_that_fails_is_told_nothing_more_and_its_error_is_kept() {
+        let mut told = 0;
+        let mut observer = |_| {
+            told += 1;
+            Err(Error::Interrupted)
+        };
+        let journal = Journal::new(&mut observer, true);
+        (0..3).for_each(|k| journal.step(format_args!("step {k}")));
+        assert!(journal.failed() && matches!(journal.into_result(), Err(Error::Interrupted)));
+        assert_eq!(told, 1);
     }
 }

@@ -9,21 +9,20 @@
 //! that has shown a complete state of its car can drive it.
 //!
 //! ```no_run
-//! use std::{path::Path, sync::atomic::AtomicBool};
+//! use std::path::Path;
+//! use steersman::observer::StopSignal;
 //! use steersman::pilot::Pilot;
-//! use steersman::serve::{Console, Server, ServerOptions};
-//!
-//! struct Terminal;
-//! impl Console for Terminal {
-//!     fn line(&self, text: &str) {
-//!         eprintln!("{text}");
-//!     }
-//!     fn status(&self, _: &str) {}
-//! }
+//! use steersman::serve::{ServeEvent, Server, ServerOptions};
 //!
 //! let pilot = Pilot::load(Path::new("runs/default-1/model.safetensors"))?;
-//! let stop = AtomicBool::new(false);
-//! let summary = Server::bind(ServerOptions::default())?.run(pilot, &Terminal, &stop)?;
+//! let mut observer = |event| {
+//!     if let ServeEvent::Line(text) = event {
+//!         eprintln!("{text}");
+//!     }
+//!     Ok(())
+//! };
+//! let stop = StopSignal::default(); // requested from elsewhere, it ends the serving
+//! let summary = Server::bind(ServerOptions::default())?.run(pilot, &mut observer, &stop)?;
 //! println!("{} frames answered", summary.frames);
 //! # Ok::<(), steersman::Error>(())
 //! ```
@@ -47,4 +46,4 @@ pub mod tokens;
 
 pub use helm::HelmOptions;
 pub use latency::Latencies;
-pub use server::{Console, Server, ServerOptions, Summary};
+pub use server::{ServeEvent, Server, ServerOptions, Summary};

@@ -11,10 +11,9 @@ use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
 use std::thread::JoinHandle;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
-use time::OffsetDateTime;
-
 use super::helm::Clock;
 use super::protocol::Command;
+use crate::dataset::udacity_writer::{HEADER, picture_name, write_row};
 use crate::error::{Error, Result};
 use crate::files::new_folder::create_now;
 
@@ -168,35 +167,20 @@ fn now_ms() -> u64 {
 /// Writes rows until there are no more; returns their number. A row is in the log only once its picture is on the disk.
 fn write(images: &Path, log: &Path, mut file: BufWriter<File>, rows: &Receiver<Row>) -> Result<u64> {
     let mut written = 0;
-    writeln!(file, "center,left,right,steering,throttle,brake,speed").map_err(Error::io(log))?;
+    file.write_all(HEADER.as_bytes()).map_err(Error::io(log))?;
     while let Ok(row) = rows.recv() {
-        let name = image_name(row.time_ms);
+        let name = picture_name("center", row.time_ms);
         let path = images.join(&name);
         fs::write(&path, &row.image).map_err(Error::io(&path))?;
         let Command { steering, throttle } = row.command;
         let (accelerator, brake, speed) = (throttle.max(0.0), (-throttle).max(0.0), row.speed_mph as f32);
-        writeln!(file, "IMG/{name}, , , {steering}, {accelerator}, {brake}, {speed}")
+        let picture = format!("IMG/{name}");
+        write_row(&mut file, ", ", [&picture, &"", &""], [steering, accelerator, brake, speed])
             .and_then(|()| file.flush())
             .map_err(Error::io(log))?;
         written += 1;
     }
     Ok(written)
-}
-
-/// Name of a picture taken `time_ms` after 1970, UTC.
-fn image_name(time_ms: u64) -> String {
-    let time = i64::try_from(time_ms / 1000).ok().and_then(|s| OffsetDateTime::from_unix_timestamp(s).ok());
-    let time = time.unwrap_or(OffsetDateTime::UNIX_EPOCH);
-    format!(
-        "center_{:04}_{:02}_{:02}_{:02}_{:02}_{:02}_{:03}.jpg",
-        time.year(),
-        u8::from(time.month()),
-        time.day(),
-        time.hour(),
-        time.minute(),
-        time.second(),
-        time_ms % 1000
-    )
 }
 
 #[cfg(test)]
@@ -212,14 +196,6 @@ mod tests {
         let mut bytes = Vec::new();
         jpeg::encode(&RgbFrame::default(), &mut bytes).unwrap();
         bytes
-    }
-
-    #[test]
-    fn names_carry_the_time_in_utc() {
-        assert_eq!(image_name(0), "center_1970_01_01_00_00_00_000.jpg");
-        // `date -u -d @1709210096` is 2024-02-29 12:34:56.
-        assert_eq!(image_name(1_709_210_096_789), "center_2024_02_29_12_34_56_789.jpg");
-        assert_eq!(image_name(u64::MAX), "center_1970_01_01_00_00_00_615.jpg");
     }
 
     #[test]

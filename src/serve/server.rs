@@ -21,6 +21,7 @@ use super::registry::Registry;
 use super::seat::Seat;
 use crate::error::{Error, Result};
 use crate::net::http;
+use crate::observer::{Observer, StopSignal};
 use crate::pilot::Pilot;
 
 /// Connections that are kept at once.
@@ -36,12 +37,13 @@ const LONELY: Duration = Duration::from_secs(15);
 /// Stack of a connection's thread, bytes.
 const STACK: usize = 1 << 20;
 
-/// Where lines for the person at the keyboard go.
-pub trait Console: Sync {
+/// What a server tells the person at the keyboard.
+#[derive(Clone, Debug, PartialEq)]
+pub enum ServeEvent {
     /// A line that stays.
-    fn line(&self, text: &str);
+    Line(String),
     /// The line that shows how it goes; replaces the one before. Comes about once a second while a client is driven.
-    fn status(&self, text: &str);
+    Status(String),
 }
 
 /// How to serve.
@@ -143,7 +145,7 @@ pub(super) struct Shared<'a> {
     pub journal: Journal<'a>,
     pub recorder: Option<Recorder>,
     pub recording_failed: AtomicBool,
-    pub stop: &'a AtomicBool,
+    pub stop: &'a StopSignal,
     registry: Registry,
     statistics: Mutex<Statistics>,
 }
@@ -185,27 +187,33 @@ impl Server {
         self.listener.local_addr().map_err(|e| Error::System(format!("cannot tell the address: {e}")))
     }
 
-    /// Serves until `stop` is set. The driven car then gets its throttle cut.
+    /// Serves until `stop` is requested. The driven car then gets its throttle cut.
     ///
     /// # Errors
     ///
-    /// If a recording cannot be written.
-    pub fn run(self, pilot: Pilot, console: &dyn Console, stop: &AtomicBool) -> Result<Summary> {
+    /// If a recording cannot be written; the observer's own, which also end the serving.
+    pub fn run(
+        self,
+        pilot: Pilot,
+        observer: &mut (dyn Observer<ServeEvent> + Send),
+        stop: &StopSignal,
+    ) -> Result<Summary> {
         let Server { listener, options, recorder } = self;
         let shared = Shared {
             options: &options,
             pilot: Mutex::new(pilot),
             seat: Seat::default(),
-            journal: Journal::new(console, options.check),
+            journal: Journal::new(observer, options.check),
             recorder,
             recording_failed: AtomicBool::new(false),
             stop,
             registry: Registry::new(MAX_CONNECTIONS),
             statistics: Mutex::default(),
         };
-        let connections = std::thread::scope(|scope| listen(&listener, scope, &shared, console));
+        let connections = std::thread::scope(|scope| listen(&listener, scope, &shared));
         let events = shared.journal.counts();
         let recorded = shared.recorder.map(Recorder::finish).transpose()?;
+        shared.journal.into_result()?;
         let statistics = shared.statistics.into_inner().unwrap_or_else(PoisonError::into_inner);
         let seconds = match (statistics.first, statistics.last) {
             (Some(first), Some(last)) => last.duration_since(first).as_secs_f64(),
@@ -227,16 +235,16 @@ impl Server {
 }
 
 /// Accepts connections until it is told to stop; returns their number.
-fn listen<'scope, 'env>(
+fn listen<'scope, 'env, 'o>(
     listener: &TcpListener,
     scope: &'scope Scope<'scope, 'env>,
-    shared: &'env Shared<'env>,
-    console: &dyn Console,
+    shared: &'env Shared<'o>,
 ) -> u64 {
     let began = Instant::now();
     let (mut connections, mut lonely) = (0, true);
     let mut last_status = began;
-    while !shared.stop.load(Ordering::Relaxed) && !shared.recording_failed.load(Ordering::Relaxed) {
+    let failed = || shared.recording_failed.load(Ordering::Relaxed) || shared.journal.failed();
+    while !shared.stop.requested() && !failed() {
         match listener.accept() {
             Ok((stream, address)) => {
                 connections += 1;
@@ -251,7 +259,7 @@ fn listen<'scope, 'env>(
             last_status = Instant::now();
             let status = shared.statistics().status(since.as_secs_f64());
             if let Some(status) = status {
-                console.status(&status);
+                shared.journal.status(status);
             }
             if lonely && began.elapsed() >= LONELY {
                 lonely = false;
@@ -260,13 +268,13 @@ fn listen<'scope, 'env>(
         }
     }
     // Threads that serve a connection look at `stop`; a failed recording ends them, too.
-    shared.stop.store(true, Ordering::Relaxed);
+    shared.stop.request();
     connections
 }
 
-fn admit<'scope, 'env>(
+fn admit<'scope, 'env, 'o>(
     scope: &'scope Scope<'scope, 'env>,
-    shared: &'env Shared<'env>,
+    shared: &'env Shared<'o>,
     id: u64,
     stream: TcpStream,
     address: SocketAddr,

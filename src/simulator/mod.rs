@@ -23,7 +23,7 @@ pub use scenery::light::Variant;
 pub use scenery::world::World;
 pub use trial::closed_loop::ClosedLoop;
 pub use trial::drive::{DriveOptions, DriveResult, DriveSummary, compare, drive, drive_observed};
-pub use trial::observer::{DriveFrame, DriveObserver};
+pub use trial::observer::{DriveEvent, DriveFrame};
 pub use trial::run::{DriveState, Driver, Expert, Run, RunOptions, Zero, run_observed};
 
 #[cfg(test)]

@@ -11,6 +11,7 @@ use super::trial::run::run;
 use super::trial::trajectory::trajectory_csv;
 use super::*;
 use crate::Error;
+use crate::observer::Unobserved;
 
 fn lake_spec() -> TrackSpec {
     toml::from_str(builtin::text("lake").unwrap()).unwrap()
@@ -150,7 +151,7 @@ fn the_same_seed_gives_the_same_bytes_for_any_number_of_threads() {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         let options = RecordOptions { laps: 0.03, seed, noise: 0.05, ..Default::default() };
         let out = dir.path().join(name);
-        let info = pool.install(|| record(&track, &options, &out, &|_| true)).unwrap();
+        let info = pool.install(|| record(&track, &options, &out, &mut Unobserved)).unwrap();
         assert!(info.rows > 20);
         hash_of(&out)
     };
@@ -173,7 +174,7 @@ fn recordings_have_the_format_of_udacitys_simulator() {
     let track = Track::load("coast").unwrap();
     let sample = RecordOptions { laps: 0.01, ..Default::default() };
     let out = dir.path().join("new/sample");
-    record(&track, &sample, &out, &|_| true).unwrap();
+    record(&track, &sample, &out, &mut Unobserved).unwrap();
     let text = fs::read_to_string(out.join("driving_log.csv")).unwrap();
     let mut lines = text.lines();
     assert_eq!(lines.next(), Some("center,left,right,steering,throttle,brake,speed"));
@@ -193,17 +194,17 @@ fn recordings_have_the_format_of_udacitys_simulator() {
     assert_eq!(side["rows"].as_integer(), Some(text.lines().count() as i64 - 1));
 
     let before = hash_of(&out);
-    let refused = record(&track, &sample, &out, &|_| true).unwrap_err().to_string();
+    let refused = record(&track, &sample, &out, &mut Unobserved).unwrap_err().to_string();
     assert!(refused.contains("exists already"), "{refused}");
     assert_eq!(before, hash_of(&out));
 
     let v2 = dir.path().join("v2");
-    record(&track, &RecordOptions { format: LogFormat::V2, ..sample.clone() }, &v2, &|_| true).unwrap();
+    record(&track, &RecordOptions { format: LogFormat::V2, ..sample.clone() }, &v2, &mut Unobserved).unwrap();
     let text = fs::read_to_string(v2.join("driving_log.csv")).unwrap();
     let first: Vec<&str> = text.lines().next().unwrap().split(',').collect();
     assert!(first.len() == 7 && Path::new(first[0]).is_absolute() && Path::new(first[0]).exists());
 
-    let stopped = record(&track, &sample, &dir.path().join("stopped"), &|_| false);
+    let stopped = record(&track, &sample, &dir.path().join("stopped"), &mut |_| Err(Error::Interrupted));
     assert!(matches!(stopped, Err(Error::Interrupted)));
     let mut left: Vec<_> = fs::read_dir(dir.path()).unwrap().map(|entry| entry.unwrap().file_name()).collect();
     left.sort();

@@ -5,6 +5,7 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 use crate::error::{Error, Result};
+use crate::observer::{Observer, Progress, Tally};
 use crate::picture::RgbImage;
 use crate::pilot::Pilot;
 use crate::report::explain::footage::{Footage, Projector};
@@ -212,16 +213,16 @@ pub struct Counterfactuals {
 ///
 /// # Errors
 ///
-/// As [`Footage::picture`]; [`Error::Input`] if there is no picture.
+/// As [`Footage::picture`]; [`Error::Input`] if there is no picture; the observer's own.
 pub fn examine(
     pilot: &Pilot,
     footage: &Footage,
-    progress: &(dyn Fn(f64) -> bool + Sync),
+    observer: &mut (dyn Observer<Progress> + Send),
 ) -> Result<(Counterfactuals, Vec<f32>)> {
     if footage.is_empty() {
         return Err(Error::Input("there is no picture to look at".into()));
     }
-    let done = std::sync::atomic::AtomicUsize::new(0);
+    let tally = Tally::new(footage.len(), observer);
     let fresh = || (pilot.clone(), Projector::default(), RgbImage::default(), RgbImage::default());
     let look = |(pilot, projector, image, changed): &mut (Pilot, Projector, RgbImage, RgbImage), i: usize| {
         footage.picture(i, projector, image)?;
@@ -231,8 +232,8 @@ pub fn examine(
             change.apply(image, changed);
             *answer = pilot.steer(changed.height, changed.width, &changed.pixels)?;
         }
-        let count = done.fetch_add(1, std::sync::atomic::Ordering::Relaxed) + 1;
-        if progress(count as f64 / footage.len() as f64) { Ok(answers) } else { Err(Error::Interrupted) }
+        tally.add(1)?;
+        Ok(answers)
     };
     let answers: Vec<[f32; Change::ALL.len() + 1]> =
         (0..footage.len()).into_par_iter().map_init(fresh, look).collect::<Result<_>>()?;

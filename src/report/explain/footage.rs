@@ -2,12 +2,12 @@
 
 use std::path::{Path, PathBuf};
 
-use crate::dataset::{self, Camera};
+use crate::dataset::{self, View};
 use crate::error::{Error, Result};
 use crate::picture::{RgbImage, decode::decode_rgb};
 use crate::simulator::camera::jpeg::RoundTrip;
 use crate::simulator::recorder::record::{Sample, drive_expert};
-use crate::simulator::{Camera as View, HEIGHT, Mount, RecordOptions, Renderer, RgbFrame, Track, Variant, WIDTH};
+use crate::simulator::{Camera, HEIGHT, Mount, RecordOptions, Renderer, RgbFrame, Track, Variant, WIDTH};
 
 /// Where the pictures come from.
 pub enum Footage {
@@ -47,7 +47,7 @@ impl Footage {
                 let recording = dataset::load(path)?;
                 recording.require_usable()?;
                 for row in 0..recording.rows.len() {
-                    if let Some(image) = recording.image_path(row, Camera::Centre) {
+                    if let Some(image) = recording.image_path(row, View::Centre) {
                         let name = format!("line {}", recording.rows[row].line);
                         files.push((image, Some(recording.rows[row].steering), name));
                     }
@@ -114,7 +114,7 @@ impl Footage {
             }
             Footage::Drive { track, variant, samples } => {
                 let Projector { renderer, frame, jpeg } = projector;
-                let view = View::new(&samples[i].body, Mount::Center);
+                let view = Camera::new(&samples[i].body, Mount::Center);
                 renderer.render(track.world(), variant, &view, Mount::Center, frame);
                 jpeg.apply(frame)?;
                 (image.height, image.width) = (HEIGHT, WIDTH);

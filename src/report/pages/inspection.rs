@@ -3,7 +3,7 @@
 use crate::dataset::colour::Colour;
 use crate::dataset::inspect::{Inspection, Suspicion, contradiction, seen_steering};
 use crate::dataset::preprocess::Preprocessing;
-use crate::dataset::{Camera, Recording};
+use crate::dataset::{Recording, View};
 use crate::picture::RgbImage;
 use crate::recipe::Recipe;
 use crate::report::charts::chart::{Axis, Chart, Mark};
@@ -224,21 +224,21 @@ fn samples(page: &mut Page, recording: &Recording, recipe: &Recipe, count: usize
         None => "the recipe uses the centre camera only".into(),
     };
     page.paragraph(&format!("From hard left to hard right; {used}. A mirrored picture has the negated label."));
-    let cameras: Vec<Camera> =
-        [Camera::Left, Camera::Centre, Camera::Right].into_iter().filter(|&camera| recording.has(camera)).collect();
+    let cameras: Vec<View> =
+        [View::Left, View::Centre, View::Right].into_iter().filter(|&camera| recording.has(camera)).collect();
     let mut figures = Vec::new();
     for row in from_left_to_right(recording, count) {
         let (line, steering) = (recording.rows[row].line, recording.rows[row].steering);
         for &camera in &cameras {
             let Some(image) = recording.picture(row, camera) else { continue };
-            let label = if recipe.samples.side_cameras.is_some() || camera == Camera::Centre {
+            let label = if recipe.samples.side_cameras.is_some() || camera == View::Centre {
                 format!("{:+.3}", recipe.samples.label(steering, camera))
             } else {
                 "unused".into()
             };
             figures.push(camera_figure(&image, format!("line {line}, {}: label {label}", camera.name())));
-            if camera == *cameras.last().unwrap_or(&Camera::Centre)
-                && let Some(centre) = recording.picture(row, Camera::Centre)
+            if camera == *cameras.last().unwrap_or(&View::Centre)
+                && let Some(centre) = recording.picture(row, View::Centre)
             {
                 figures.push(camera_figure(
                     &centre.mirrored(),
@@ -262,7 +262,7 @@ fn colours(page: &mut Page, recording: &Recording, spec: &Preprocessing, count: 
     let mut rows = from_left_to_right(recording, count.max(2));
     rows.truncate(count);
     for row in rows {
-        let Some(image) = recording.picture(row, Camera::Centre) else { continue };
+        let Some(image) = recording.picture(row, View::Centre) else { continue };
         page.subsection(&format!("Line {}, label {:+.3}", recording.rows[row].line, recording.rows[row].steering));
         let mut figures =
             vec![camera_figure(&kept_rows(&image, spec), "the camera's picture; what is kept is not darkened".into())];
@@ -345,7 +345,7 @@ fn worst(page: &mut Page, inspection: &Inspection, count: usize) {
     let figures: Vec<Figure> = chosen
         .into_iter()
         .filter_map(|(row, why)| {
-            let image = recording.picture(row, Camera::Centre)?;
+            let image = recording.picture(row, View::Centre)?;
             let (line, steering) = (recording.rows[row].line, recording.rows[row].steering);
             Some(camera_figure(&image, format!("line {line}, label {steering:+.3}\n{why}")))
         })

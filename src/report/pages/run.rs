@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use rayon::prelude::*;
 
 use crate::dataset::held_out::trained_on_held_out;
-use crate::dataset::{Camera, Item};
+use crate::dataset::{Item, View};
 use crate::engine::network::{Network, group_digits};
 use crate::error::Result;
 use crate::files::atomic_file;
@@ -159,7 +159,7 @@ fn learning_curves(history: &[EpochRecord]) -> Vec<String> {
 /// What the model says of the centre images of the validation side, in their order; those that cannot be decoded left out.
 fn answers(pilot: &Pilot, data: &Data) -> Vec<Answer> {
     let centre: Vec<Item> =
-        data.split().validation.iter().copied().filter(|item| item.cameras().any(|c| c == Camera::Centre)).collect();
+        data.split().validation.iter().copied().filter(|item| item.cameras().any(|c| c == View::Centre)).collect();
     // Sessions are counted through all recordings.
     let mut sessions_before = vec![0];
     for recording in data.recordings() {
@@ -168,7 +168,7 @@ fn answers(pilot: &Pilot, data: &Data) -> Vec<Answer> {
     let answer = |pilot: &mut Pilot, item: Item| {
         let (index, row) = (usize::from(item.recording), item.row as usize);
         let recording = &data.recordings()[index];
-        let steering = pilot.steer_file(&recording.image_path(row, Camera::Centre)?).ok()?;
+        let steering = pilot.steer_file(&recording.image_path(row, View::Centre)?).ok()?;
         let prediction = Prediction {
             steering,
             label: recording.rows[row].steering,
@@ -298,7 +298,7 @@ fn worst(page: &mut Page, answers: &[Answer], data: &Data, full_lock_deg: f64) {
         .filter_map(|Answer { item, prediction }| {
             let recording = &data.recordings()[usize::from(item.recording)];
             let row = item.row as usize;
-            let mut image = recording.picture(row, Camera::Centre)?;
+            let mut image = recording.picture(row, View::Centre)?;
             let [human_deg, model_deg] = [prediction.label, prediction.steering].map(|s| f64::from(s) * full_lock_deg);
             draw_steering(&mut image, human_deg, HUMAN);
             draw_steering(&mut image, model_deg, MODEL);

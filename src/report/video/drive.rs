@@ -7,10 +7,11 @@ use super::onlooker::Onlooker;
 use super::painter::{Captions, FilmFrame, Painter};
 use super::summary::VideoSummary;
 use crate::error::{Error, Result};
+use crate::observer::{Observer, Progress};
 use crate::picture::RgbImage;
 use crate::simulator::car::dynamics::MAX_STEER_DEG;
 use crate::simulator::trial::run::{DRIVE_HZ, Failure};
-use crate::simulator::{DriveFrame, DriveObserver, Driver, HEIGHT, Run, RunOptions, Track, WIDTH, run_observed};
+use crate::simulator::{DriveEvent, DriveFrame, Driver, HEIGHT, Run, RunOptions, Track, WIDTH, run_observed};
 
 /// A video of a run that is yet to be driven.
 pub struct DriveVideo {
@@ -25,7 +26,7 @@ struct FilmObserver<'a> {
     film: &'a mut DriveVideo,
     /// Whether the driver looks at pictures, so that its time to answer means something.
     looks: bool,
-    progress: &'a mut dyn FnMut(f64) -> bool,
+    observer: &'a mut dyn Observer<Progress>,
 }
 
 impl DriveVideo {
@@ -47,9 +48,9 @@ impl DriveVideo {
         Ok(DriveVideo { video, frame, onlooker })
     }
 
-    /// Drives the run `seed`, as [`run`](crate::simulator::trial::run::run) does and to the same bits, and writes the video. `progress`
-    /// is told the share of the way that is made and may return `false` to stop; what there is by then is written, and the second
-    /// value is `true`.
+    /// Drives the run `seed`, as [`run`](crate::simulator::trial::run::run) does and to the same bits, and writes the video. `observer`
+    /// is told the share of the way that is made. If it returns [`Error::Interrupted`], what there is by then is written, and the
+    /// second value is `true`.
     ///
     /// # Errors
     ///
@@ -60,10 +61,10 @@ impl DriveVideo {
         driver: &mut dyn Driver,
         options: &RunOptions,
         seed: u64,
-        progress: &mut dyn FnMut(f64) -> bool,
+        observer: &mut dyn Observer<Progress>,
     ) -> Result<(VideoSummary, bool)> {
         let looks = driver.needs_frame();
-        match run_observed(track, driver, options, seed, &mut FilmObserver { film: &mut self, looks, progress }) {
+        match run_observed(track, driver, options, seed, &mut FilmObserver { film: &mut self, looks, observer }) {
             Ok(run) => Ok((self.video.finish(&outcome(&run, options))?, false)),
             Err(Error::Interrupted) => Ok((self.video.finish("stopped")?, true)),
             Err(error) => Err(error),
@@ -71,7 +72,16 @@ impl DriveVideo {
     }
 }
 
-impl DriveObserver for FilmObserver<'_> {
+impl<'e> Observer<DriveEvent<'e>> for FilmObserver<'_> {
+    fn observe(&mut self, event: DriveEvent<'e>) -> Result<()> {
+        match event {
+            DriveEvent::Begin { .. } => Ok(()),
+            DriveEvent::Frame(frame) => self.frame(frame),
+        }
+    }
+}
+
+impl FilmObserver<'_> {
     fn frame(&mut self, driven: &DriveFrame) -> Result<()> {
         let DriveVideo { video, frame, onlooker } = &mut *self.film;
         let simulation = driven.simulation;
@@ -90,10 +100,7 @@ impl DriveObserver for FilmObserver<'_> {
         frame.put_back = driven.put_back;
         video.show(frame)?;
         let way_m = driven.options.laps as f64 * simulation.track.length_m;
-        match (self.progress)((simulation.progress_m / way_m).clamp(0.0, 1.0)) {
-            true => Ok(()),
-            false => Err(Error::Interrupted),
-        }
+        self.observer.observe(Progress((simulation.progress_m / way_m).clamp(0.0, 1.0)))
     }
 }
 

@@ -52,3 +52,12 @@ impl Video {
         self.timeline.finish()
     }
 }
+
+/// Whether an observer wants no more of a video.
+pub(super) fn ended_early(observed: Result<()>) -> Result<bool> {
+    match observed {
+        Ok(()) => Ok(false),
+        Err(Error::Interrupted) => Ok(true),
+        Err(error) => Err(error),
+    }
+}

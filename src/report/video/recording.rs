@@ -2,12 +2,13 @@
 
 use std::path::Path;
 
-use super::film::Video;
+use super::film::{Video, ended_early};
 use super::onlooker::Onlooker;
 use super::painter::{Captions, FilmFrame, Painter};
 use super::summary::VideoSummary;
-use crate::dataset::{self, Camera, Recording};
+use crate::dataset::{self, Recording, View};
 use crate::error::{Error, Result};
+use crate::observer::{Observer, Progress};
 use crate::picture::decode::decode_rgb;
 use crate::simulator::car::dynamics::MAX_STEER_DEG;
 
@@ -15,8 +16,8 @@ use crate::simulator::car::dynamics::MAX_STEER_DEG;
 const LONE_ROW_HZ: f64 = 20.0;
 
 /// Writes the video of the recording `path` to the new file `out`: `fps` pictures a second, or as many as were recorded.
-/// Sessions follow each other without the time between them. `progress` is told the share that is done and may return `false`
-/// to stop; what there is by then is written, and the second value is `true`.
+/// Sessions follow each other without the time between them. `observer` is told the share that is done. If it
+/// returns [`Error::Interrupted`], what there is by then is written, and the second value is `true`.
 ///
 /// # Errors
 ///
@@ -26,7 +27,7 @@ pub fn film(
     out: &Path,
     mut onlooker: Option<Onlooker>,
     fps: Option<f64>,
-    progress: &mut dyn FnMut(f64) -> bool,
+    observer: &mut dyn Observer<Progress>,
 ) -> Result<(VideoSummary, bool)> {
     let recording = dataset::load(path)?;
     recording.require_usable()?;
@@ -61,7 +62,7 @@ pub fn film(
             frame.reference_deg = Some(f64::from(at.steering) * full_lock_deg);
             frame.speed_mph = Some(f64::from(at.speed_mph)).filter(|mph| mph.is_finite());
             video.show(&frame)?;
-            if !progress((row + 1) as f64 / recording.rows.len() as f64) {
+            if ended_early(observer.observe(Progress((row + 1) as f64 / recording.rows.len() as f64)))? {
                 stopped = true;
                 break 'sessions;
             }
@@ -80,7 +81,7 @@ fn name(path: &Path) -> String {
 }
 
 fn read(recording: &Recording, row: usize, frame: &mut FilmFrame) -> Result<()> {
-    let path = recording.image_path(row, Camera::Centre);
+    let path = recording.image_path(row, View::Centre);
     let path =
         path.ok_or_else(|| Error::data(&recording.path, format!("row {row} has no picture of the centre camera")))?;
     let bytes = std::fs::read(&path).map_err(Error::io(&path))?;

@@ -2,12 +2,13 @@
 
 use std::path::{Path, PathBuf};
 
-use super::film::Video;
+use super::film::{Video, ended_early};
 use super::lettering::end_of;
 use super::onlooker::Onlooker;
 use super::painter::{Captions, FilmFrame, Painter};
 use super::summary::VideoSummary;
 use crate::error::{Error, Result};
+use crate::observer::{Observer, Progress};
 use crate::picture::RgbImage;
 use crate::simulator::camera::eye::Eye;
 use crate::simulator::car::dynamics::{MAX_STEER_DEG, MPS_PER_MPH};
@@ -26,7 +27,7 @@ pub struct RunChoice {
 }
 
 /// Writes the video of a run of the drive in `folder` to the new file `out`. What steered is drawn as it was saved; an
-/// `onlooker` steers in its place, without changing the way. `progress` and the result are as in
+/// `onlooker` steers in its place, without changing the way. `observer` and the result are as in
 /// [`recording::film`](super::recording::film).
 ///
 /// # Errors
@@ -39,7 +40,7 @@ pub fn film(
     out: &Path,
     mut onlooker: Option<Onlooker>,
     fps: Option<f64>,
-    progress: &mut dyn FnMut(f64) -> bool,
+    observer: &mut dyn Observer<Progress>,
 ) -> Result<(VideoSummary, bool)> {
     let (seed, path) = choose(folder, choice)?;
     let track = Track::load(&read_summary(folder)?.track)?;
@@ -82,7 +83,7 @@ pub fn film(
         frame.put_back = waypoint.intervention > 0;
         put_back += usize::from(frame.put_back);
         video.show(&frame)?;
-        if !progress((k + 1) as f64 / way.len() as f64) {
+        if ended_early(observer.observe(Progress((k + 1) as f64 / way.len() as f64)))? {
             stopped = true;
             break;
         }

@@ -22,4 +22,4 @@ mod scene;
 
 pub use handshake::ServerUrl;
 pub use reaction::Numbers;
-pub use scene::{ClientOptions, ClientReport, Observer, Pace, drive};
+pub use scene::{ClientEvent, ClientOptions, ClientReport, Pace, drive};

@@ -7,6 +7,7 @@ use data_encoding::BASE64;
 use super::connection::{Connection, Event};
 use super::handshake::ServerUrl;
 use super::reaction::{Numbers, Steer};
+use crate::observer::{Observer, Progress};
 use crate::serve::protocol::{DecimalMark, Readings, print_telemetry};
 use crate::simulator::camera::eye::Eye;
 use crate::simulator::car::dynamics::{MAX_STEER_DEG, STEP_S};
@@ -106,24 +107,25 @@ pub struct ClientReport {
     pub round_trips_ms: Vec<f64>,
 }
 
-/// Is told how the drive goes.
-pub trait Observer {
+/// What happens in a drive.
+#[derive(Clone, Debug, PartialEq)]
+pub enum ClientEvent {
     /// Something to know: connected, lost, a reply that could not be read.
-    fn notice(&mut self, text: &str);
-    /// Share of the way that is made. `false` stops the drive.
-    fn progress(&mut self, share: f64) -> bool;
+    Notice(String),
+    /// A share of the way is made.
+    Progress(Progress),
 }
 
 /// Drives on `track` with the server of `options` at the wheel.
 ///
 /// # Errors
-/// Impossible options, a server that does not reply for longer than `patience_s`, or if `observer` stopped it.
-pub fn drive(track: &Track, options: &ClientOptions, observer: &mut dyn Observer) -> Result<ClientReport> {
+/// Impossible options, a server that does not reply for longer than `patience_s`, and the observer's own.
+pub fn drive(track: &Track, options: &ClientOptions, observer: &mut dyn Observer<ClientEvent>) -> Result<ClientReport> {
     check(options)?;
     let mut scene = Scene::new(track, options, observer);
     let driven = match options.scene_change_s {
         Some(_) => scene.play(options.scene_change_s).and_then(|_| {
-            scene.change();
+            scene.change()?;
             scene.play(None)
         }),
         None => scene.play(None),
@@ -173,7 +175,7 @@ struct Sent {
 struct Scene<'a> {
     track: &'a Track,
     options: &'a ClientOptions,
-    observer: &'a mut dyn Observer,
+    observer: &'a mut dyn Observer<ClientEvent>,
     connection: Connection,
     eye: Eye<'a>,
     /// The picture in base64, and the step at which it was taken.
@@ -202,7 +204,7 @@ struct Scene<'a> {
 }
 
 impl<'a> Scene<'a> {
-    fn new(track: &'a Track, options: &'a ClientOptions, observer: &'a mut dyn Observer) -> Scene<'a> {
+    fn new(track: &'a Track, options: &'a ClientOptions, observer: &'a mut dyn Observer<ClientEvent>) -> Scene<'a> {
         // The world takes a while to build, and a server does not like to wait for the first telemetry.
         let eye = Eye::new(track, options.seed);
         Scene {
@@ -228,13 +230,15 @@ impl<'a> Scene<'a> {
     }
 
     /// Leaves the scene and enters it again.
-    fn change(&mut self) {
-        self.observer.notice("the scene changes: the connection ends without a close frame");
+    fn change(&mut self) -> Result<()> {
+        self.observer
+            .observe(ClientEvent::Notice("the scene changes: the connection ends without a close frame".into()))?;
         let connection = Connection::start(&self.options.url, self.options.numbers, self.options.seed);
         let left = std::mem::replace(&mut self.connection, connection);
         self.connections += left.count();
         left.abort();
         (self.due, self.command, self.sent, self.image_step) = (0, (0.0, 0.0), None, None);
+        Ok(())
     }
 
     /// Drives from the start to the end of the run, or until the scene is left.
@@ -265,7 +269,8 @@ impl<'a> Scene<'a> {
         }
         if closed_loop.is_too_slow() {
             let time_s = closed_loop.simulation().time_s();
-            self.observer.notice(&format!("the run ends after {time_s:.0} s: the car is far too slow for its laps"));
+            let notice = format!("the run ends after {time_s:.0} s: the car is far too slow for its laps");
+            self.observer.observe(ClientEvent::Notice(notice))?;
         }
         Ok(closed_loop.finish())
     }
@@ -286,7 +291,7 @@ impl<'a> Scene<'a> {
     /// Sends telemetry for every token and waits for a reply to it.
     fn exchange(&mut self, closed_loop: &ClosedLoop) -> Result<()> {
         while let Some(event) = self.connection.poll() {
-            self.take(event);
+            self.take(event)?;
         }
         loop {
             self.wait_for_turn()?;
@@ -318,10 +323,10 @@ impl<'a> Scene<'a> {
         let event = self.connection.wait(Duration::from_secs_f64(TICK_S));
         let waited_s = began.elapsed().as_secs_f64().min(TICK_S);
         if let Some(event) = event {
-            self.take(event);
+            self.take(event)?;
         }
         self.be_patient(waited_s)?;
-        if self.observer.progress(self.share) { Ok(()) } else { Err(Error::Interrupted) }
+        self.observer.observe(ClientEvent::Progress(Progress(self.share)))
     }
 
     /// One rendered frame of Unity: the physics that are due, then the events, then the telemetry.
@@ -339,7 +344,7 @@ impl<'a> Scene<'a> {
         }
         self.be_patient(passed_s.min(TICK_S))?;
         while let Some(event) = self.connection.poll() {
-            self.take(event);
+            self.take(event)?;
         }
         while self.due > 0 {
             self.send_telemetry(closed_loop)?;
@@ -350,7 +355,7 @@ impl<'a> Scene<'a> {
 
     fn progress(&mut self, closed_loop: &ClosedLoop) -> Result<()> {
         self.share = closed_loop.share();
-        if self.observer.progress(self.share) { Ok(()) } else { Err(Error::Interrupted) }
+        self.observer.observe(ClientEvent::Progress(Progress(self.share)))
     }
 
     /// Counts time without a reply.
@@ -375,7 +380,7 @@ impl<'a> Scene<'a> {
     }
 
     /// Takes note of an event.
-    fn take(&mut self, event: Event) {
+    fn take(&mut self, event: Event) -> Result<()> {
         match event {
             Event::Open => {
                 if self.since.is_none() {
@@ -394,7 +399,7 @@ impl<'a> Scene<'a> {
                     }
                     None => {
                         self.report.tokens_lost += 1;
-                        self.notice("a command cannot be read: the simulator sends no telemetry for it".into());
+                        self.notice("a command cannot be read: the simulator sends no telemetry for it".into())?;
                     }
                 }
             }
@@ -407,23 +412,25 @@ impl<'a> Scene<'a> {
             }
             Event::Closed(why) => {
                 self.sent = None;
-                self.notice(format!("{why}; connecting again"));
+                self.notice(format!("{why}; connecting again"))?;
                 self.trouble = why;
             }
             Event::Unreachable(why) => {
-                self.notice(format!("{}: {why}; trying again", self.options.url));
+                self.notice(format!("{}: {why}; trying again", self.options.url))?;
                 self.trouble = why;
             }
         }
+        Ok(())
     }
 
     /// Passes a notice on, unless it is the same as just before.
-    fn notice(&mut self, text: String) {
+    fn notice(&mut self, text: String) -> Result<()> {
         let again = |(last, at): &(String, Instant)| *last == text && at.elapsed() < SAME_NOTICE;
         if !self.noticed.as_ref().is_some_and(again) {
-            self.observer.notice(&text);
+            self.observer.observe(ClientEvent::Notice(text.clone()))?;
             self.noticed = Some((text, Instant::now()));
         }
+        Ok(())
     }
 
     fn reply(&mut self, arrived: Instant) {

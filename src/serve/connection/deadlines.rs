@@ -18,7 +18,7 @@ const MISSING_TIME: Duration = Duration::from_secs(5);
 /// A client that answers no ping, or never was of use, is given up after this time without a complete message.
 const SILENCE_LIMIT: Duration = Duration::from_millis(PING_INTERVAL_MS + PING_TIMEOUT_MS);
 
-impl Connection<'_> {
+impl Connection<'_, '_> {
     /// What is due apart from messages.
     pub(super) fn after_beat(&mut self) -> Result<(), End> {
         if let Some((text, came)) = self.held.take() {

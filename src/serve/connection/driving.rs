@@ -21,7 +21,7 @@ const STRONG_THROTTLE: f32 = 0.2;
 /// Commands with a strong throttle after which a car must show it.
 const DEAF_AFTER: u32 = 40;
 
-impl Connection<'_> {
+impl Connection<'_, '_> {
     /// Answers the newest telemetry, whose last byte came at `came`.
     pub(super) fn answer(&mut self, packet: ClientPacket, came: Instant) -> Result<(), End> {
         let telemetry = match packet {

@@ -7,7 +7,6 @@ mod opening;
 use std::net::SocketAddr;
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::sync::Arc;
-use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use tungstenite::{Message, Utf8Bytes, WebSocket};
@@ -85,8 +84,8 @@ pub(super) fn serve(shared: &Shared, peer: &Arc<Peer>, address: SocketAddr) {
 }
 
 /// A WebSocket and what is known of the client behind it.
-struct Connection<'a> {
-    shared: &'a Shared<'a>,
+struct Connection<'a, 'o> {
+    shared: &'a Shared<'o>,
     peer: &'a Arc<Peer>,
     address: SocketAddr,
     websocket: WebSocket<Socket>,
@@ -125,11 +124,11 @@ struct Connection<'a> {
     reply: String,
 }
 
-impl Connection<'_> {
+impl Connection<'_, '_> {
     fn run(&mut self) -> Result<(), End> {
         let mut batch = Vec::with_capacity(MAX_BATCH);
         loop {
-            if self.shared.stop.load(Ordering::Relaxed) {
+            if self.shared.stop.requested() {
                 return Ok(());
             }
             self.websocket.get_mut().begin_beat();
@@ -172,7 +171,7 @@ impl Connection<'_> {
         const STEP: Duration = Duration::from_millis(5);
         let now = Instant::now();
         let until = now + self.pace.charge(messages, bytes, now);
-        while !self.shared.stop.load(Ordering::Relaxed) && !self.peer.is_closing() {
+        while !self.shared.stop.requested() && !self.peer.is_closing() {
             let left = until.saturating_duration_since(Instant::now());
             if left.is_zero() {
                 return;

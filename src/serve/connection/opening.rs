@@ -3,7 +3,6 @@
 use std::io::{Read, Write};
 use std::net::SocketAddr;
 use std::sync::Arc;
-use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use tungstenite::WebSocket;
@@ -24,7 +23,11 @@ use crate::serve::tokens::Tokens;
 const HANDSHAKE_TIME: Duration = Duration::from_secs(5);
 
 /// Reads the request and answers it.
-pub(super) fn open<'a>(shared: &'a Shared, peer: &'a Arc<Peer>, address: SocketAddr) -> Result<Connection<'a>, End> {
+pub(super) fn open<'a, 'o>(
+    shared: &'a Shared<'o>,
+    peer: &'a Arc<Peer>,
+    address: SocketAddr,
+) -> Result<Connection<'a, 'o>, End> {
     let journal = &shared.journal;
     journal.step(format_args!("{address}: TCP connection"));
     let mut socket = Socket::new(peer.stream.try_clone()?, SLOW_BEAT)?;
@@ -39,7 +42,7 @@ pub(super) fn open<'a>(shared: &'a Shared, peer: &'a Arc<Peer>, address: SocketA
             Err(error) if is_timeout(&error) => {}
             Err(error) => return Err(error.into()),
         }
-        if shared.stop.load(Ordering::Relaxed) {
+        if shared.stop.requested() {
             return Err(End::Closed);
         }
         match examine(&head, &shared.options.allowed_origins) {

@@ -2,12 +2,12 @@
 
 use std::fs;
 use std::path::Path;
-use std::sync::atomic::{AtomicUsize, Ordering};
 
 use rayon::prelude::*;
 use serde::Serialize;
 
 use crate::files::new_folder::NewFolder;
+use crate::observer::{Observer, Progress, Tally};
 use crate::simulator::camera::eye::Eye;
 use crate::simulator::camera::pinhole::BodyPose;
 use crate::simulator::car::dynamics::{Controls, MPS_PER_MPH, STEP_S, STEPS_PER_S};
@@ -292,24 +292,23 @@ pub fn drive_and_label(
 
 /// Records a drive of the expert into the new folder `out`: `driving_log.csv`, `IMG/` and `recording.toml`.
 ///
-/// Pictures are taken on all threads; the files do not depend on their number. `progress` is told the share that is done
-/// and may return `false` to stop.
+/// Pictures are taken on all threads; the files do not depend on their number.
 ///
 /// # Errors
-/// If `out` exists, if something cannot be written, or if `progress` stopped it. Nothing is left behind then: the folder
+/// If `out` exists, if something cannot be written, or if the observer returns an error. Nothing is left behind then: the folder
 /// gets its name when it is whole.
 pub fn record(
     track: &Track,
     options: &RecordOptions,
     out: &Path,
-    progress: &(dyn Fn(f64) -> bool + Sync),
+    observer: &mut (dyn Observer<Progress> + Send),
 ) -> Result<RecordingInfo> {
     if !(options.laps > 0.0 && options.laps <= 1000.0) {
         return Err(Error::Usage(format!("laps {}: more than 0 and at most 1000 can be recorded", options.laps)));
     }
     options.check()?;
     let samples = drive_expert(track, options);
-    write_recording(track, options, &samples, out, progress)
+    write_recording(track, options, &samples, out, observer)
 }
 
 /// Takes the pictures of `samples` and writes a recording, as [`record`] does.
@@ -321,10 +320,10 @@ pub fn write_recording(
     options: &RecordOptions,
     samples: &[Sample],
     out: &Path,
-    progress: &(dyn Fn(f64) -> bool + Sync),
+    observer: &mut (dyn Observer<Progress> + Send),
 ) -> Result<RecordingInfo> {
     let folder = NewFolder::create(out)?;
-    let info = fill(track, options, samples, &folder, out, progress).map_err(|error| folder.explain(error))?;
+    let info = fill(track, options, samples, &folder, out, observer).map_err(|error| folder.explain(error))?;
     folder.finish()?;
     Ok(info)
 }
@@ -336,17 +335,16 @@ fn fill(
     samples: &[Sample],
     folder: &NewFolder,
     out: &Path,
-    progress: &(dyn Fn(f64) -> bool + Sync),
+    observer: &mut (dyn Observer<Progress> + Send),
 ) -> Result<RecordingInfo> {
     let images = folder.unfinished().join("IMG");
     fs::create_dir(&images).map_err(Error::io(&images))?;
     let world = track.world();
     let variant = Variant::new(world, options.seed);
-    let done = AtomicUsize::new(0);
+    let tally = Tally::new(samples.len(), observer);
     samples.par_iter().try_for_each_init(Photographer::default, |photographer, sample| {
         photographer.take(world, &variant, sample, &images)?;
-        let count = done.fetch_add(1, Ordering::Relaxed) + 1;
-        if progress(count as f64 / samples.len() as f64) { Ok(()) } else { Err(Error::Interrupted) }
+        tally.add(1)
     })?;
     let log = folder.unfinished().join("driving_log.csv");
     let lines = LogLines::new(options.format, out)?;

@@ -1,15 +1,15 @@
 //! Many closed-loop runs of one driver on one track, and the comparison of two drivers.
 
-use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Instant;
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::files::new_folder::NewFolder;
+use crate::observer::{Observer, Progress, Tally};
 use crate::simulator::car::speed::Speed;
 use crate::simulator::road::track::Track;
-use crate::simulator::trial::observer::DriveObserver;
+use crate::simulator::trial::observer::DriveEvent;
 use crate::simulator::trial::run::{Driver, Expert, INTERVENTION_M, Run, RunOptions, line_errors_m, run, run_observed};
 use crate::simulator::trial::statistics::{PairedTest, wilson_interval};
 use crate::simulator::trial::trajectory::{SUMMARY, trajectory_csv};
@@ -116,30 +116,26 @@ pub struct DriveResult {
 }
 
 /// Drives every seed of `options` twice, free and assisted, runs in parallel; results do not depend on the number of
-/// threads. `new_driver` makes a fresh driver for a run; `progress` is told the share that is done and may return `false`
-/// to stop.
+/// threads. `new_driver` makes a fresh driver for a run.
 ///
 /// # Errors
-/// Impossible options, a driver that cannot be made, or if `progress` stopped it.
+/// Impossible options, a driver that cannot be made, and the observer's own.
 pub fn drive<F>(
     track: &Track,
     new_driver: F,
     options: &DriveOptions,
-    progress: &(dyn Fn(f64) -> bool + Sync),
+    observer: &mut (dyn Observer<Progress> + Send),
 ) -> Result<DriveResult>
 where
     F: Fn() -> Result<Box<dyn Driver>> + Sync,
 {
     check(options)?;
-    let done = AtomicUsize::new(0);
+    let tally = Tally::new(options.runs, observer);
     let measured: Vec<Measured> = (0..options.runs as u64)
         .into_par_iter()
         .map(|k| {
             let measured = measure(track, &new_driver, options, k, None)?;
-            let count = done.fetch_add(1, Ordering::Relaxed) + 1;
-            if !progress(count as f64 / options.runs as f64) {
-                return Err(Error::Interrupted);
-            }
+            tally.add(1)?;
             Ok(measured)
         })
         .collect::<Result<_>>()?;
@@ -154,7 +150,7 @@ pub fn drive_observed<F>(
     track: &Track,
     new_driver: F,
     options: &DriveOptions,
-    observer: &mut dyn DriveObserver,
+    observer: &mut dyn for<'a> Observer<DriveEvent<'a>>,
 ) -> Result<DriveResult>
 where
     F: Fn() -> Result<Box<dyn Driver>>,
@@ -180,7 +176,7 @@ fn measure<F>(
     new_driver: &F,
     options: &DriveOptions,
     k: u64,
-    mut observer: Option<&mut dyn DriveObserver>,
+    mut observer: Option<&mut dyn for<'a> Observer<DriveEvent<'a>>>,
 ) -> Result<Measured>
 where
     F: Fn() -> Result<Box<dyn Driver>>,
@@ -324,13 +320,13 @@ pub fn write_trajectories(result: &DriveResult, folder: NewFolder) -> Result<()>
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::simulator::trial::observer::DriveFrame;
+    use crate::observer::Unobserved;
     use crate::simulator::trial::run::Zero;
 
     fn go(track: &str, expert: bool, runs: usize) -> DriveResult {
         let track = Track::load(track).unwrap();
         let make = || -> Result<Box<dyn Driver>> { Ok(if expert { Box::new(Expert) } else { Box::new(Zero) }) };
-        drive(&track, make, &DriveOptions { runs, ..Default::default() }, &|_| true).unwrap()
+        drive(&track, make, &DriveOptions { runs, ..Default::default() }, &mut Unobserved).unwrap()
     }
 
     #[test]
@@ -362,13 +358,12 @@ mod tests {
     #[test]
     fn a_drive_that_is_watched_has_the_same_runs() {
         struct Watching(Vec<(u64, bool)>, usize);
-        impl DriveObserver for Watching {
-            fn begin(&mut self, seed: u64, options: &RunOptions) {
-                self.0.push((seed, options.assisted));
-            }
-
-            fn frame(&mut self, _: &DriveFrame) -> Result<()> {
-                self.1 += 1;
+        impl<'a> Observer<DriveEvent<'a>> for Watching {
+            fn observe(&mut self, event: DriveEvent) -> Result<()> {
+                match event {
+                    DriveEvent::Begin { seed, options } => self.0.push((seed, options.assisted)),
+                    DriveEvent::Frame(_) => self.1 += 1,
+                }
                 Ok(())
             }
         }
@@ -377,7 +372,7 @@ mod tests {
         let options = DriveOptions { runs: 2, seed: 3, ..Default::default() };
         let mut watching = Watching(Vec::new(), 0);
         let watched = drive_observed(&track, make, &options, &mut watching).unwrap();
-        let unseen = drive(&track, make, &options, &|_| true).unwrap();
+        let unseen = drive(&track, make, &options, &mut Unobserved).unwrap();
         assert_eq!(watched.runs, unseen.runs);
         let summary = DriveSummary { realtime_factor: unseen.summary.realtime_factor, ..watched.summary };
         assert_eq!(summary, unseen.summary);
@@ -398,8 +393,11 @@ mod tests {
             DriveOptions { latency_ms: -1.0, ..Default::default() },
             DriveOptions { noise: f64::NAN, ..Default::default() },
         ] {
-            assert!(matches!(drive(&track, make, &bad, &|_| true), Err(Error::Usage(_))));
+            assert!(matches!(drive(&track, make, &bad, &mut Unobserved), Err(Error::Usage(_))));
         }
-        assert!(matches!(drive(&track, make, &DriveOptions::default(), &|_| false), Err(Error::Interrupted)));
+        assert!(matches!(
+            drive(&track, make, &DriveOptions::default(), &mut |_| Err(Error::Interrupted)),
+            Err(Error::Interrupted)
+        ));
     }
 }

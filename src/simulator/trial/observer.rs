@@ -2,7 +2,6 @@
 
 use std::time::Duration;
 
-use crate::Result;
 use crate::simulator::camera::pinhole::RgbFrame;
 use crate::simulator::car::simulation::Simulation;
 use crate::simulator::trial::run::RunOptions;
@@ -39,15 +38,16 @@ impl DriveFrame<'_> {
     }
 }
 
-/// Sees every frame of a run as it is driven. It changes nothing of the run, except that it may end it.
-pub trait DriveObserver {
+/// What happens in a run. Observers change nothing of the run, except that they may end it.
+#[derive(Clone, Copy)]
+pub enum DriveEvent<'a> {
     /// A run begins.
-    fn begin(&mut self, _seed: u64, _options: &RunOptions) {}
-
-    /// Takes notice of a frame. An error ends the run and becomes its result; [`Interrupted`](crate::Error::Interrupted) is
-    /// for whoever has seen enough.
-    ///
-    /// # Errors
-    /// If the run is not to go on.
-    fn frame(&mut self, frame: &DriveFrame) -> Result<()>;
+    Begin {
+        /// What draws its start, light and noise.
+        seed: u64,
+        /// How it is driven.
+        options: &'a RunOptions,
+    },
+    /// The driver has answered a frame.
+    Frame(&'a DriveFrame<'a>),
 }

@@ -3,6 +3,7 @@
 use std::time::Instant;
 
 use crate::Result;
+use crate::observer::Observer;
 use crate::simulator::camera::eye::Eye;
 use crate::simulator::camera::pinhole::RgbFrame;
 use crate::simulator::car::dynamics::STEP_S;
@@ -11,7 +12,7 @@ use crate::simulator::car::simulation::Simulation;
 use crate::simulator::car::speed::{Speed, SpeedController, telemetry_mph};
 use crate::simulator::road::track::Track;
 use crate::simulator::trial::closed_loop::ClosedLoop;
-use crate::simulator::trial::observer::{DriveFrame, DriveObserver};
+use crate::simulator::trial::observer::{DriveEvent, DriveFrame};
 use crate::simulator::trial::statistics::quantile;
 
 /// Frames that a driver sees in each second. At 50 steps a second they come after 3 and 2 steps in turn.
@@ -184,7 +185,7 @@ pub fn run_observed(
     driver: &mut dyn Driver,
     options: &RunOptions,
     seed: u64,
-    observer: &mut dyn DriveObserver,
+    observer: &mut dyn for<'a> Observer<DriveEvent<'a>>,
 ) -> Result<Run> {
     drive_run(track, driver, options, seed, Some(observer))
 }
@@ -194,14 +195,14 @@ fn drive_run(
     driver: &mut dyn Driver,
     options: &RunOptions,
     seed: u64,
-    mut observer: Option<&mut dyn DriveObserver>,
+    mut observer: Option<&mut dyn for<'a> Observer<DriveEvent<'a>>>,
 ) -> Result<Run> {
     let mut closed_loop = ClosedLoop::new(track, options, seed);
     let mut eye = (driver.needs_frame() || observer.is_some()).then(|| Eye::new(track, seed));
     let blank = RgbFrame::default();
     let mut controller = SpeedController::default();
     if let Some(observer) = &mut observer {
-        observer.begin(seed, options);
+        observer.observe(DriveEvent::Begin { seed, options })?;
     }
     while closed_loop.goes_on() {
         if closed_loop.frame_is_due() {
@@ -219,7 +220,7 @@ fn drive_run(
             closed_loop.answer(steering, throttle);
             if let (Some(observer), Some(moment)) = (&mut observer, closed_loop.last_moment()) {
                 let simulation = closed_loop.simulation();
-                observer.frame(&DriveFrame {
+                let frame = DriveFrame {
                     picture,
                     simulation,
                     options,
@@ -230,7 +231,8 @@ fn drive_run(
                     put_back: moment.intervention,
                     interventions: closed_loop.interventions(),
                     answered_in,
-                })?;
+                };
+                observer.observe(DriveEvent::Frame(&frame))?;
             }
         }
         closed_loop.step();
@@ -303,8 +305,9 @@ mod tests {
     #[test]
     fn an_observer_sees_every_frame_and_changes_nothing() {
         struct Watching(Vec<(f64, f64, bool)>, usize);
-        impl DriveObserver for Watching {
-            fn frame(&mut self, frame: &DriveFrame) -> Result<()> {
+        impl<'a> Observer<DriveEvent<'a>> for Watching {
+            fn observe(&mut self, event: DriveEvent) -> Result<()> {
+                let DriveEvent::Frame(frame) = event else { return Ok(()) };
                 assert!(frame.picture.pixels.iter().any(|p| *p > 0));
                 assert_eq!((frame.lap(), frame.expert_steering), (1, expert::pursuit(frame.simulation)));
                 self.0.push((frame.simulation.time_s(), frame.steering, frame.put_back));

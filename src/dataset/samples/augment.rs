@@ -4,7 +4,7 @@
 //! They act on the RGB stage of preprocessing (cropped, before the colour conversion), in this order: shift, shadows,
 //! lines, colours, brightness. Each is drawn anew for every sample and epoch.
 
-use super::preprocess::Preprocessing;
+use crate::dataset::pictures::preprocess::Preprocessing;
 use crate::engine::random::{below, uniform, unit};
 use crate::{Error, Result};
 use rand::Rng;

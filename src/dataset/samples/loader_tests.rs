@@ -132,7 +132,7 @@ fn an_epoch_shows_every_image_and_its_mirror_once() {
     assert_eq!(sorted(first), sorted(second));
     assert_ne!(first[0].2, second[0].2, "a new order in each epoch");
     let validation = epochs(&mut validation);
-    assert!(validation.iter().all(|batch| batch.2.iter().all(|s| !s.mirrored && s.camera == Camera::Centre)));
+    assert!(validation.iter().all(|batch| batch.2.iter().all(|s| !s.mirrored && s.camera == View::Centre)));
     assert!(validation[0].2.is_sorted_by_key(|sample| sample.row));
 }
 
@@ -203,7 +203,7 @@ fn random_mirrors_change_from_epoch_to_epoch() {
 fn broken_images_are_left_out_and_counted() {
     let folder = tempfile::tempdir().unwrap();
     let recordings = recordings(folder.path(), 150);
-    let path = recordings[0].image_path(0, Camera::Left).unwrap();
+    let path = recordings[0].image_path(0, View::Left).unwrap();
     fs::write(&path, b"\xff\xd8 no picture \xff\xd9").unwrap();
     let none = SplitSpec { validation_share: 0.0, ..Default::default() };
     let split = split(&recordings, &none, &spec().samples, &Balance::default(), 0).unwrap();

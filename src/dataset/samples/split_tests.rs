@@ -115,7 +115,7 @@ fn images_of_a_row_fall_on_both_sides_with_random_images() {
     assert!(split.training.len() > 900 && split.validation.len() > 200);
     let centre_only = SampleSpec { validation_side_cameras: false, ..samples };
     let split = super::split(&recordings, &spec, &centre_only, &Balance::default(), 5).unwrap();
-    assert!(split.validation.iter().all(|item| item.cameras().eq([Camera::Centre])));
+    assert!(split.validation.iter().all(|item| item.cameras().eq([View::Centre])));
 }
 
 #[test]

@@ -5,7 +5,7 @@
 //! exponents, decimal commas, and sessions appended one after the other.
 
 use super::decimal_comma;
-use super::recording::Reason;
+use crate::dataset::unusable::Reason;
 use std::io::{self, BufRead, Read};
 
 /// A longer line is no line of a log.
@@ -15,7 +15,7 @@ const LABEL_SLACK: f64 = 1e-5;
 
 /// A row as written, before its images are looked for.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Entry {
+pub(crate) struct Entry {
     pub line: u32,
     /// Paths as written.
     pub images: [Option<String>; 3],
@@ -27,7 +27,7 @@ pub(super) struct Entry {
 
 /// What a line of a log holds.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) enum Line {
+pub(crate) enum Line {
     Row(Entry),
     Unusable { line: u32, reason: Reason, detail: String },
 }
@@ -42,7 +42,7 @@ struct Columns {
 }
 
 /// Reads a log line by line.
-pub(super) struct Log<R> {
+pub(crate) struct Log<R> {
     input: R,
     line: u32,
     buffer: Vec<u8>,
@@ -252,7 +252,7 @@ fn entry(line: u32, images: [Option<String>; 3], values: [f64; 4]) -> Result<Ent
 }
 
 /// Milliseconds from 1970 of a file name that ends in `YYYY_MM_DD_HH_mm_ss_fff.jpg`; `None` if it does not.
-pub(super) fn time_of(file: &str) -> Option<i64> {
+pub(crate) fn time_of(file: &str) -> Option<i64> {
     let stem = file.rsplit_once('.').map_or(file, |(stem, _)| stem);
     let mut parts = stem.rsplit('_').map(|part| part.parse::<i64>().ok());
     let mut next = || parts.next().flatten();

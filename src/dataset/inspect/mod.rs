@@ -5,9 +5,11 @@ mod frames;
 mod lag;
 mod suspicious;
 
-use super::load::{ImageCheck, load_with};
-use super::recording::{Camera, Kind, Recording, Row, Unusable};
 use crate::Result;
+use crate::dataset::load::{ImageCheck, load_with};
+use crate::dataset::recording::{Kind, Recording, Row, View};
+use crate::dataset::unusable::Unusable;
+use crate::observer::{Observer, Progress};
 pub use frames::Frame;
 pub use lag::Lag;
 use serde::Serialize;
@@ -54,7 +56,7 @@ pub struct Report {
     /// Whether the times come from the recording; otherwise rows count as 20 Hz.
     pub times_plausible: bool,
     /// Cameras that have images.
-    pub cameras: Vec<Camera>,
+    pub cameras: Vec<View>,
     /// Height and width of the first image.
     pub image_size: Option<[usize; 2]>,
     /// The labels; `None` without rows.
@@ -169,11 +171,11 @@ impl Spread {
 }
 
 /// Reads the recording at `path`, looks at its pictures and describes it. Where no image can be read, the log alone is
-/// described. `progress` is told the share of the pictures that is done.
+/// described. `observer` is told the share of the pictures that is done.
 ///
 /// # Errors
-/// As [`super::load`].
-pub fn inspect(path: &Path, progress: &(dyn Fn(f64) + Sync)) -> Result<Inspection> {
+/// As [`super::load`]; the observer's own.
+pub fn inspect(path: &Path, observer: &mut (dyn Observer<Progress> + Send)) -> Result<Inspection> {
     let checked = load_with(path, ImageCheck::Verify)?;
     if checked.rows.is_empty() && checked.total_rows() > 0 {
         let log_alone = load_with(path, ImageCheck::Skip)?;
@@ -186,7 +188,7 @@ pub fn inspect(path: &Path, progress: &(dyn Fn(f64) + Sync)) -> Result<Inspectio
             return Ok(Inspection { recording: log_alone, frames: Vec::new(), report });
         }
     }
-    let frames = frames::look(&checked, progress);
+    let frames = frames::look(&checked, observer)?;
     let report = describe(path, &checked, &frames);
     Ok(Inspection { recording: checked, frames, report })
 }
@@ -212,7 +214,7 @@ fn describe(path: &Path, recording: &Recording, frames: &[Option<Frame>]) -> Rep
         span_s: span_ms as f64 / 1000.0,
         rate_hz: recording.rate_hz(),
         times_plausible: recording.times_plausible,
-        cameras: Camera::ALL.into_iter().filter(|&camera| recording.has(camera)).collect(),
+        cameras: View::ALL.into_iter().filter(|&camera| recording.has(camera)).collect(),
         image_size: recording.image_size,
         steering: describe_steering(rows),
         throttle: Spread::of(rows.iter().map(|row| row.throttle)),
@@ -401,6 +403,7 @@ fn bars(histogram: &[usize]) -> String {
 mod tests {
     use super::*;
     use crate::dataset::testing::{recording_of, recordings_folder};
+    use crate::observer::Unobserved;
 
     #[test]
     fn labels_are_described() {
@@ -441,7 +444,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("log.csv");
         std::fs::write(&path, "c.jpg,l.jpg,r.jpg,0.5,1,0,9\nc.jpg,l.jpg,r.jpg,x,1,0,9\n").unwrap();
-        let report = inspect(&path, &|_| ()).unwrap().report;
+        let report = inspect(&path, &mut Unobserved).unwrap().report;
         let json = serde_json::to_value(&report).unwrap();
         assert_eq!((json["rows"].as_u64(), json["usable"].as_u64()), (Some(2), Some(0)));
         assert_eq!(json["unusable"]["not-a-number"]["rows"], 1);
@@ -455,11 +458,11 @@ mod tests {
         let Some(root) = recordings_folder() else { return };
         for (name, rows) in [("bydavy-mixed", 150), ("jwasham12-track2-mac", 150), ("spgitmonish-own-header", 149)] {
             let path = root.join("csv-variants").join(format!("{name}.csv"));
-            let report = inspect(&path, &|_| ()).unwrap().report;
+            let report = inspect(&path, &mut Unobserved).unwrap().report;
             assert_eq!((report.rows, report.usable), (rows, 0), "{name}");
             assert!(report.steering.is_some());
         }
-        let lake = inspect(&root.join("lake-sample"), &|_| ()).unwrap().report;
+        let lake = inspect(&root.join("lake-sample"), &mut Unobserved).unwrap().report;
         assert!((lake.steering.unwrap().zero_share - 0.56).abs() < 0.01);
         assert_eq!(lake.image_size, Some([160, 320]));
         let pictures = lake.pictures.unwrap();

@@ -1,7 +1,7 @@
 //! donkeycar tubs of format 2: `manifest.json`, catalogs of one JSON record a line, and a folder `images`.
 
-use super::driving_log::{Entry, Line};
-use super::recording::Reason;
+use super::udacity::{Entry, Line};
+use crate::dataset::unusable::Reason;
 use crate::{Error, Result};
 use serde::Deserialize;
 use std::collections::BTreeSet;
@@ -36,7 +36,7 @@ struct Record {
 }
 
 /// A record with what a log of the simulator would not hold.
-pub(super) struct TubLine {
+pub(crate) struct TubLine {
     pub line: Line,
     pub catalog: String,
     pub time_ms: Option<i64>,
@@ -44,7 +44,7 @@ pub(super) struct TubLine {
 }
 
 /// Reads the records of a tub one after the other.
-pub(super) struct Tub {
+pub(crate) struct Tub {
     folder: PathBuf,
     catalogs: std::vec::IntoIter<String>,
     open: Option<(String, BufReader<File>, u32)>,

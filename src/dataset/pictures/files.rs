@@ -1,6 +1,6 @@
 //! The image files of a recording: finding them, checking them, and remembering them in few bytes.
 
-use super::recording::Reason;
+use crate::dataset::unusable::Reason;
 use crate::picture::decode::{ends_complete, starts_as_image};
 use std::collections::HashMap;
 use std::ffi::OsString;
@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 /// Names of image files. A name is a *place* (a folder, and for `left_2016….jpg` the part before the time) and the
 /// rest; the places are few, and the three cameras of a row share the rest.
 #[derive(Debug, Default)]
-pub(super) struct Files {
+pub(crate) struct Files {
     places: Vec<OsString>,
     numbers: HashMap<OsString, u16>,
     names: String,
@@ -19,7 +19,7 @@ pub(super) struct Files {
 
 /// A file name in [`Files`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Name {
+pub(crate) struct Name {
     place: u16,
     length: u16,
     start: u32,
@@ -74,7 +74,7 @@ impl Files {
 
 /// Looks for the images a log names: logs move between folders, machines and systems.
 #[derive(Debug, Clone)]
-pub(super) struct Locator {
+pub(crate) struct Locator {
     /// Folder of the log.
     base: PathBuf,
 }
@@ -124,7 +124,7 @@ impl Locator {
 }
 
 /// Folder and file name of a path of any system.
-pub(super) fn split_path(path: &str) -> (&str, &str) {
+pub(crate) fn split_path(path: &str) -> (&str, &str) {
     match path.rfind(['/', '\\']) {
         Some(at) => (&path[..at.max(1)], &path[at + 1..]),
         None => ("", path),

@@ -4,8 +4,8 @@
 //! validation frame has a twin among the training frames, and the validation loss says little about new road. The
 //! default, `blocks`, holds out contiguous stretches of time with a guard of a second on both sides.
 
-use super::recording::{Camera, Recording};
-use super::samples::{Balance, Item, SampleSpec};
+use super::{Balance, Item, SampleSpec};
+use crate::dataset::recording::{Recording, View};
 use crate::engine::random::{Purpose, rng, shuffle, unit};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
@@ -143,8 +143,8 @@ pub fn split(
         set_cameras(&mut split.validation, recordings, validate_sides);
     } else if !validate_sides {
         split.validation.retain_mut(|item| {
-            let centre = item.cameras().any(|camera| camera == Camera::Centre);
-            *item = Item::new(item.recording, item.row, [Camera::Centre]);
+            let centre = item.cameras().any(|camera| camera == View::Centre);
+            *item = Item::new(item.recording, item.row, [View::Centre]);
             centre
         });
     }
@@ -312,7 +312,7 @@ fn rows_of_images(mut images: Vec<Item>) -> Vec<Item> {
 }
 
 fn rows_of(recording: u16, rows: Range<usize>) -> impl Iterator<Item = Item> {
-    rows.map(move |row| Item::new(recording, row as u32, [Camera::Centre]))
+    rows.map(move |row| Item::new(recording, row as u32, [View::Centre]))
 }
 
 fn all_rows(recordings: &[Recording]) -> Vec<Item> {
@@ -334,9 +334,8 @@ fn drop_low_throttle(items: &mut Vec<Item>, recordings: &[Recording], samples: &
 fn set_cameras(items: &mut [Item], recordings: &[Recording], sides: bool) {
     for item in items {
         let recording = &recordings[usize::from(item.recording)];
-        let used =
-            |camera: &Camera| *camera == Camera::Centre || (sides && recording.row_has(item.row as usize, *camera));
-        *item = Item::new(item.recording, item.row, Camera::ALL.into_iter().filter(used));
+        let used = |camera: &View| *camera == View::Centre || (sides && recording.row_has(item.row as usize, *camera));
+        *item = Item::new(item.recording, item.row, View::ALL.into_iter().filter(used));
     }
 }
 

@@ -7,9 +7,9 @@
 //! on average. That is about what a car at 30 mph sees change in a tenth of a second: with a split by single rows a
 //! fifth to a third of the validation frames of real drives have a near twin.
 
-use super::recording::Recording;
-use super::samples::Item;
+use super::Item;
 use super::split::Split;
+use crate::dataset::recording::Recording;
 use crate::picture::RgbImage;
 use rayon::prelude::*;
 use serde::Serialize;

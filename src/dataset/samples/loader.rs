@@ -5,12 +5,12 @@
 //! threads, cache or order of calls.
 
 use super::augment::Augmentation;
-use super::cache::{CacheSpec, ImageCache};
 use super::leak::{NearTwins, Thumbnail};
-use super::preprocess::{Preprocessing, Preprocessor};
-use super::recording::{Camera, Recording};
-use super::samples::{Flip, Group, Item, SampleSpec};
 use super::split::Split;
+use super::{Flip, Group, Item, SampleSpec};
+use crate::dataset::pictures::cache::{CacheSpec, ImageCache};
+use crate::dataset::pictures::preprocess::{Preprocessing, Preprocessor};
+use crate::dataset::recording::{Recording, View};
 use crate::engine::random::{Purpose, rng, shuffle, unit};
 use crate::engine::stopwatch::Stopwatch;
 use crate::picture::{RgbImage, decode::decode_rgb};
@@ -46,7 +46,7 @@ pub struct SampleId {
     /// Which row of it.
     pub row: u32,
     /// Which camera.
-    pub camera: Camera,
+    pub camera: View,
     /// Whether the image is mirrored, and the label negated.
     pub mirrored: bool,
 }
@@ -76,7 +76,7 @@ pub struct Loader {
     flip: Flip,
     items: Vec<Item>,
     /// Each image: its item and camera. Images of an item stand together.
-    images: Vec<(u32, Camera)>,
+    images: Vec<(u32, View)>,
     /// First image of each item, and their number at the end.
     first_images: Vec<u32>,
     /// What is taken in this order: samples, or items with [`Group::Rows`].
@@ -358,7 +358,7 @@ impl Loader {
             let planned = self.spec.preprocessing.plan(decoded.height, decoded.width);
             *preprocessor = planned.map_err(|error| failed(error.to_string()))?;
         }
-        if camera == Camera::Centre {
+        if camera == View::Centre {
             let Preprocessing { rows, source, .. } = self.spec.preprocessing;
             self.thumbnails[item as usize].get_or_init(|| Thumbnail::of(decoded, rows, source[0]));
         }
