@@ -16,7 +16,6 @@ use crate::picture::{
     decode::{MAX_SIDE, decode_rgb_within},
 };
 use crate::recipe::Recipe;
-use crate::simulator::{DriveState, Driver, RgbFrame};
 
 /// A model that predicts the steering of one image after the other on the calling thread.
 ///
@@ -217,13 +216,6 @@ impl Pilot {
             Error::Codec(message) | Error::Input(message) => Error::data(path, message),
             other => other,
         })
-    }
-}
-
-impl Driver for Pilot {
-    fn steer(&mut self, frame: &RgbFrame, _: &DriveState) -> f32 {
-        // A frame always has the size it says, so this cannot fail; the simulator takes what is no number as straight ahead.
-        Pilot::steer(self, frame.view()).unwrap_or(f32::NAN)
     }
 }
 

@@ -21,7 +21,7 @@ use crate::engine::network::{LayerSpec, Network};
 use crate::engine::optimizer::{OptimizerSpec, Schedule, ScheduleSpec};
 use crate::engine::tensor::Shape;
 use crate::error::{Error, Result};
-use crate::suggest::did_you_mean;
+use crate::suggestion::did_you_mean;
 
 /// Name and text of each recipe that is built in.
 pub const SHIPPED: [(&str, &str); 5] = [

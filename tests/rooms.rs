@@ -5,24 +5,27 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 /// The top-level rooms. A room may use those above it.
-const ROOMS: [&str; 23] = [
+const ROOMS: [&str; 26] = [
     "error",
-    "suggest",
+    "suggestion",
     "text",
     "observer",
     "metrics",
+    "statistics",
     "picture",
     "files",
     "net",
     "engine",
     "dataset",
+    "udacity",
     "recipe",
     "model_file",
     "training",
-    "simulator",
     "pilot",
+    "simulator",
     "report",
     "exchange",
+    "simulator_client",
     "serve",
     "live",
     "main_job",

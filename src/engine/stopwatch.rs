@@ -1,13 +1,11 @@
 //! A stopwatch for one kind of work, summed over threads.
 //!
 //! It counts CPU time of the thread, which neither other programs nor a slow disk prolong; where the system does not provide it,
-//! wall time.
+//! and in an engine that is compiled alone, wall time.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
-
-use cpu_time::ThreadTime;
 
 /// Runs work and sums its time. A stopwatch that is off (the default) only runs the work. Clones share the sum.
 #[derive(Clone, Debug, Default)]
@@ -26,9 +24,9 @@ impl Stopwatch {
         if self.0.is_none() {
             return work();
         }
-        let (clock, cpu) = (Instant::now(), ThreadTime::try_now());
+        let elapsed = thread_clock();
         let result = work();
-        self.add(cpu.map_or_else(|_| clock.elapsed(), |cpu| cpu.elapsed()));
+        self.add(elapsed());
         result
     }
 
@@ -43,6 +41,20 @@ impl Stopwatch {
     pub fn seconds(&self) -> f64 {
         self.0.as_ref().map_or(0.0, |nanoseconds| nanoseconds.load(Ordering::Relaxed) as f64 * 1e-9)
     }
+}
+
+/// Starts a clock of this thread, and answers what reads it.
+#[cfg(feature = "training")]
+fn thread_clock() -> impl Fn() -> Duration {
+    let (clock, cpu) = (Instant::now(), cpu_time::ThreadTime::try_now());
+    move || cpu.as_ref().map_or_else(|_| clock.elapsed(), cpu_time::ThreadTime::elapsed)
+}
+
+/// Starts a clock, and answers what reads it.
+#[cfg(not(feature = "training"))]
+fn thread_clock() -> impl Fn() -> Duration {
+    let clock = Instant::now();
+    move || clock.elapsed()
 }
 
 #[cfg(test)]

@@ -3,7 +3,7 @@
 use crate::dataset::preprocess::Preprocessing;
 use crate::error::{Error, Result};
 use crate::recipe::{Recipe, SHIPPED};
-use crate::suggest::did_you_mean;
+use crate::suggestion::did_you_mean;
 
 /// Name and text of each preset; the files say where they come from.
 pub const PRESETS: [(&str, &str); 6] = [

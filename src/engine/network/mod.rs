@@ -6,6 +6,7 @@
 //! | [`Parameters`] | the numbers |
 //! | [`TrainingPlan`] | the buffers of a training step: forward, loss, backward |
 //! | [`InferencePlan`] | the buffers of evaluation, for parameters that change between calls |
+//! | [`ObservationPlan`] | the buffers of evaluation layer by layer, to look at each output |
 //! | [`Predictor`] | evaluation with parameters that stay: it owns them, and packs their weights once |
 //!
 //! A plan borrows the parameters for the length of a call: shared for evaluation, which therefore cannot change them.
@@ -24,13 +25,12 @@ mod structure;
 mod training;
 
 pub use inference::InferencePlan;
-pub(crate) use observation::ObservationPlan;
+pub use observation::ObservationPlan;
 pub use predictor::Predictor;
 pub use spec::LayerSpec;
 pub use step_input::StepInput;
 pub use step_profile::StageTime;
-pub(crate) use structure::group_digits;
-pub use structure::{NamedLayer, Network};
+pub use structure::{NamedLayer, Network, group_digits};
 pub use training::TrainingPlan;
 
 pub use crate::engine::parameters::{Parameters, Tensor};

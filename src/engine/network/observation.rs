@@ -5,7 +5,7 @@ use super::{Network, Parameters};
 /// The buffers of an evaluation that shows the output of every layer. [`InferencePlan`](super::InferencePlan), which runs
 /// neighbouring layers as one, is faster and sees only the last.
 #[derive(Clone, Debug)]
-pub(crate) struct ObservationPlan {
+pub struct ObservationPlan {
     /// Input and output of a layer.
     buffers: [Vec<f32>; 2],
     scratch: Vec<f32>,
@@ -13,7 +13,7 @@ pub(crate) struct ObservationPlan {
 
 impl ObservationPlan {
     /// Buffers for one image at a time.
-    pub(crate) fn new(network: &Network) -> ObservationPlan {
+    pub fn new(network: &Network) -> ObservationPlan {
         let layers = network.layers();
         let largest = layers.iter().map(|l| l.layer.output().len()).max().unwrap_or(0);
         let scratch = layers.iter().map(|l| l.layer.scratch_len(1)).max().unwrap_or(0);
@@ -26,7 +26,7 @@ impl ObservationPlan {
     /// # Panics
     ///
     /// Panics if the lengths do not fit the network.
-    pub(crate) fn run(
+    pub fn run(
         &mut self,
         network: &Network,
         parameters: &Parameters,

@@ -12,7 +12,7 @@ use crate::engine::parameters::{Parameters, Tensor};
 use crate::engine::random::{Purpose, rng};
 use crate::engine::tensor::Shape;
 use crate::error::{Error, Result};
-use crate::suggest::did_you_mean;
+use crate::suggestion::did_you_mean;
 
 /// Layers in order, each knowing its input shape.
 #[derive(Debug)]
@@ -227,7 +227,7 @@ impl Network {
 }
 
 /// `1234567` as `1,234,567`.
-pub(crate) fn group_digits(number: u64) -> String {
+pub fn group_digits(number: u64) -> String {
     let digits = number.to_string();
     let mut text = String::with_capacity(digits.len() + digits.len() / 3);
     for (i, digit) in digits.chars().enumerate() {

@@ -1,7 +1,6 @@
-//! Suggestions for names that are spelt wrong.
+//! What a misspelt name may have meant.
 
-/// ` (did you mean …?)` with the candidate of `known` that is nearest to `name` in Damerau–Levenshtein distance; empty if none
-/// is near.
+/// ` (did you mean …?)` with the nearest of `known`, or nothing if none is near.
 pub(crate) fn did_you_mean(name: &str, known: &[&str]) -> String {
     known
         .iter()
