@@ -149,28 +149,52 @@
 //! ```
 #![forbid(unsafe_code)]
 
+#[cfg(feature = "cli")]
 pub mod cli;
+#[cfg(feature = "training")]
 pub mod dataset;
 pub mod engine;
 pub mod error;
+#[cfg(feature = "exchange")]
 pub mod exchange;
+#[cfg(feature = "training")]
 pub mod files;
+#[cfg(feature = "live")]
 pub mod live;
+#[cfg(feature = "cli")]
 pub mod main_job;
+#[cfg(feature = "training")]
 pub mod metrics;
+#[cfg(feature = "training")]
 pub mod model_file;
+#[cfg(any(feature = "live", feature = "serve"))]
+#[cfg_attr(not(feature = "serve"), allow(dead_code, reason = "the live page alone needs a part of it"))]
 mod net;
+#[cfg(feature = "training")]
 pub mod observer;
+#[cfg(feature = "training")]
 pub mod picture;
+#[cfg(feature = "training")]
 pub mod pilot;
+#[cfg(feature = "training")]
 pub mod recipe;
+#[cfg(feature = "report")]
 pub mod report;
+#[cfg(feature = "serve")]
 pub mod serve;
+#[cfg(feature = "simulator")]
 pub mod simulator;
+#[cfg(feature = "serve")]
 pub mod simulator_client;
+#[cfg(feature = "simulator")]
 mod statistics;
+mod suggestion;
+#[cfg(feature = "training")]
+#[cfg_attr(not(feature = "cli"), allow(dead_code, reason = "the smaller feature sets show less foreign text"))]
 mod text;
+#[cfg(feature = "training")]
 pub mod training;
+#[cfg(feature = "serve")]
 pub mod udacity;
 
 pub use error::{Error, Result};
