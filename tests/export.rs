@@ -42,9 +42,17 @@ const LAYERS: &str = r#"[
   { kind = "softsign" },
   { kind = "dense", units = 8 },
   { kind = "relu" },
+  { kind = "swish" },
   { kind = "flatten" },
   { kind = "dense", units = 1 },
 ]"#;
+
+#[test]
+fn every_kind_of_layer_is_exported_here() {
+    for (kind, _) in steersman::engine::network::LayerSpec::EXAMPLES {
+        assert!(LAYERS.contains(&format!("kind = \"{kind}\"")), "{kind}");
+    }
+}
 
 /// Every colour space, resized in every way: halved, linear down and up, area down and up, not at all.
 const PREPROCESSINGS: [(&str, &str); 10] = [
