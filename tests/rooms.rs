@@ -145,3 +145,20 @@ fn names_are_found_in_every_form_of_a_path() {
     let code = "use crate::a::{b, c::D};\nuse crate::{e::F, g, h::{i, j}};\nlet x = crate::k::l();";
     assert_eq!(names_after(code, "crate::"), ["a", "e", "g", "h", "k"]);
 }
+
+/// Cargo runs only the tests and benches that its manifest names, and says nothing of the others.
+#[test]
+fn every_file_of_tests_and_benches_is_a_target() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let manifest = fs::read_to_string(root.join("Cargo.toml")).unwrap();
+    for (folder, kind) in [("tests", "test"), ("benches", "bench")] {
+        for entry in fs::read_dir(root.join(folder)).unwrap() {
+            let path = entry.unwrap().path();
+            let name = path.file_stem().unwrap().to_str().unwrap();
+            if path.extension().is_some_and(|extension| extension == "rs") {
+                let entry = format!("[[{kind}]]\nname = \"{name}\"\n");
+                assert!(manifest.contains(&entry), "Cargo.toml has no [[{kind}]] for {}", path.display());
+            }
+        }
+    }
+}
