@@ -336,8 +336,8 @@ impl PixelMap {
             let spread = if axis.range.is_none() { (high / low).powf(0.05) } else { 1.0 };
             (low, high) = (low / spread, high * spread);
         } else {
-            if high - low < 1e-12 * low.abs().max(1e-6) {
-                let half = (0.1 * low.abs()).max(0.5);
+            if high - low <= 1e-9 * low.abs() {
+                let half = if low == 0.0 { 0.5 } else { 0.5 * low.abs() };
                 (low, high) = (low - half, high + half);
             }
             if round && axis.range.is_none() {
@@ -443,6 +443,8 @@ mod tests {
         assert!((log.place(0.1) - 50.0).abs() < 1e-9 && log.place(0.0).is_nan());
         let rounded = PixelMap::new(&Axis::new("y"), [0.3, 9.4].into_iter(), [0.0, 1.0], true);
         assert_eq!((rounded.low, rounded.high), (0.0, 10.0));
+        let constant = PixelMap::new(&Axis::new("rate"), [0.001, 0.001].into_iter(), [0.0, 1.0], true);
+        assert!(constant.low >= 0.0 && constant.high < 0.003, "{} {}", constant.low, constant.high);
     }
 
     #[test]

@@ -200,7 +200,7 @@ impl Saliency {
                 let upper = at(i, j) * (1.0 - u) + at(i, j + 1) * u;
                 let lower = at(i + 1, j) * (1.0 - u) + at(i + 1, j + 1) * u;
                 let value = upper * (1.0 - t) + lower * t;
-                let (share, colour) = (OPACITY * value.sqrt(), palette::saliency(f64::from(value)));
+                let (share, colour) = (OPACITY * value.powf(0.7), palette::saliency(f64::from(value)));
                 let [r, g, b] = image.pixel(row, column).map(f32::from);
                 let grey = DIMMED * (0.299 * r + 0.587 * g + 0.114 * b);
                 let mixed = |k: usize| grey * (1.0 - share) + f32::from(colour[k]) * share;
