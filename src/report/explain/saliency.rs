@@ -1,4 +1,4 @@
-//! Which parts of the picture excite the network: VisualBackProp (Bojarski et al. 2016, arXiv 1611.05418), the method of
+//! Shows which parts of the picture excite the network: VisualBackProp (Bojarski et al. 2016, arXiv 1611.05418), the method of
 //! NVIDIA's "Explaining How a Deep Neural Network Trained with End-to-End Learning Steers a Car" (2017, arXiv 1704.07911).
 //!
 //! The feature maps of each convolution, after its activation, are averaged over the channels; what is negative counts as 0.
@@ -50,8 +50,7 @@ enum BackStep {
     Multiply(usize),
 }
 
-/// How a layer's output relates to its input along one axis: output `i` covers inputs `i * stride - before` and the `kernel`
-/// from there on.
+/// Receptive field of a layer along one axis: output `i` covers the `kernel` inputs from `i * stride - before` on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SpreadAxis {
     /// Inputs.
