@@ -42,6 +42,7 @@
 //! A recording is a folder with a `driving_log.csv`, or a donkeycar tub; `data/sample` is a very short one.
 //!
 //! ```
+//! use steersman::dataset::Description;
 //! use steersman::observer::StopSignal;
 //! use steersman::recipe::Recipe;
 //! use steersman::training::{TrainRequest, TrainingEvent, train};
@@ -54,8 +55,8 @@
 //! // The recipe is the experiment: preprocessing, network, split, optimizer. A path ending in .toml names one of your own.
 //! let recipe = Recipe::find("lenet", &["epochs=2".into(), "batch=16".into()])?;
 //! let recordings = vec!["data/sample".into()];
-//! let (from, algorithm, profile) = (None, None, false);
-//! let request = TrainRequest { recordings, recipe, out, seed: 1, cache_mib: 64, from, algorithm, profile };
+//! let (said, from, algorithm, profile) = (Description::default(), None, None, false);
+//! let request = TrainRequest { recordings, said, recipe, out, seed: 1, cache_mib: 64, from, algorithm, profile };
 //! let stop = StopSignal::default(); // requested from elsewhere, it ends the run after the current batch
 //! let mut observer = |event| {
 //!     match event {
@@ -74,14 +75,15 @@
 //! # Train on numbers of your own
 //!
 //! ```
-//! use steersman::engine::network::{LayerSpec, Network, StepInput, TrainingPlan};
+//! use steersman::engine::layers::DenseSpec;
+//! use steersman::engine::network::{Network, StepInput, TrainingPlan};
 //! use steersman::engine::optimizer::{Optimizer, OptimizerSpec};
 //! use steersman::engine::tensor::{Initializer, Shape};
 //! use steersman::engine::loss::Loss;
 //! use steersman_kernels::Isa;
 //!
 //! // y = x1 − x2, learned by one dense layer.
-//! let layers = [LayerSpec::Dense { units: 1, init: Initializer::GlorotUniform }];
+//! let layers = [DenseSpec { units: 1, init: Initializer::GlorotUniform }.into()];
 //! let network = Network::new(Shape::vector(2), &layers, Isa::best())?;
 //! let (x, labels) = ([1.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.5, 1.0], [1.0, -1.0, 0.0, -0.5]);
 //!
@@ -148,25 +150,52 @@
 //! ```
 #![forbid(unsafe_code)]
 
+#[cfg(feature = "cli")]
 pub mod cli;
+#[cfg(feature = "training")]
 pub mod dataset;
 pub mod engine;
 pub mod error;
+#[cfg(feature = "exchange")]
 pub mod exchange;
+#[cfg(feature = "training")]
 pub mod files;
+#[cfg(feature = "live")]
 pub mod live;
+#[cfg(feature = "cli")]
 pub mod main_job;
+#[cfg(feature = "training")]
 pub mod metrics;
+#[cfg(feature = "training")]
 pub mod model_file;
+#[cfg(any(feature = "live", feature = "serve"))]
+#[cfg_attr(not(feature = "serve"), allow(dead_code, reason = "the live page alone needs a part of it"))]
 mod net;
+#[cfg(feature = "training")]
 pub mod observer;
+#[cfg(feature = "training")]
 pub mod picture;
+#[cfg(feature = "training")]
 pub mod pilot;
+#[cfg(feature = "training")]
 pub mod recipe;
+#[cfg(feature = "report")]
 pub mod report;
+#[cfg(feature = "serve")]
 pub mod serve;
+#[cfg(feature = "simulator")]
 pub mod simulator;
+#[cfg(feature = "serve")]
+pub mod simulator_client;
+#[cfg(feature = "simulator")]
+mod statistics;
+mod suggestion;
+#[cfg(feature = "training")]
+#[cfg_attr(not(feature = "cli"), allow(dead_code, reason = "the smaller feature sets show less foreign text"))]
 mod text;
+#[cfg(feature = "training")]
 pub mod training;
+#[cfg(feature = "serve")]
+pub mod udacity;
 
 pub use error::{Error, Result};

@@ -31,7 +31,7 @@
 //! [`DriveEvent`]: crate::simulator::DriveEvent
 //! [`JobEvent`]: crate::main_job::job::JobEvent
 //! [`ServeEvent`]: crate::serve::ServeEvent
-//! [`ClientEvent`]: crate::serve::client::ClientEvent
+//! [`ClientEvent`]: crate::simulator_client::ClientEvent
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};

@@ -12,8 +12,9 @@ use super::{or_dash, print_json, stop_on_ctrl_c};
 use crate::error::{Error, Result};
 use crate::observer::Observer;
 use crate::pilot::Pilot;
-use crate::serve::{HelmOptions, ServeEvent, Server, ServerOptions, Summary, protocol};
+use crate::serve::{HelmOptions, ServeEvent, Server, ServerOptions, Summary};
 use crate::text::escaped;
+use crate::udacity;
 
 /// Drive Udacity's simulator with a model; it connects by itself in autonomous mode
 #[derive(Debug, Args)]
@@ -30,7 +31,7 @@ pub struct ServeArgs {
     #[arg(long, default_value_t = 0.0, value_name = "MS")]
     smooth: f64,
     /// Port to listen at; the simulator connects to 4567. 0 takes any free one
-    #[arg(long, default_value_t = protocol::DEFAULT_PORT)]
+    #[arg(long, default_value_t = udacity::DEFAULT_PORT)]
     port: u16,
     /// Address to listen at; 0.0.0.0 lets other machines connect
     #[arg(long, default_value = "127.0.0.1", value_name = "ADDRESS")]
@@ -71,8 +72,8 @@ pub fn run(args: ServeArgs) -> Result<()> {
     let stop = stop_on_ctrl_c()?;
     let address = server.address()?;
     say(&format!("listening on ws://{address}/socket.io/"));
-    if args.port != 0 && args.port != protocol::DEFAULT_PORT {
-        say(&format!("note: Udacity's simulator connects to port {} by itself", protocol::DEFAULT_PORT));
+    if args.port != 0 && args.port != udacity::DEFAULT_PORT {
+        say(&format!("note: Udacity's simulator connects to port {} by itself", udacity::DEFAULT_PORT));
     }
     if !args.host.is_loopback() {
         say(&format!("note: whoever reaches {address} can connect; there is no password"));

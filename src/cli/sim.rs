@@ -11,12 +11,12 @@ use crate::error::{Error, Result};
 use crate::files::atomic_file;
 use crate::files::new_folder::create_now;
 use crate::observer::Observer;
-use crate::serve::client::{ClientEvent, ClientOptions, ClientReport, Numbers, Pace, ServerUrl, drive};
-use crate::serve::protocol::DecimalMark;
 use crate::simulator::Track;
-use crate::simulator::trial::run::{Failure, line_errors_m};
-use crate::simulator::trial::statistics::quantile;
+use crate::simulator::trial::outcome::{Failure, line_errors_m};
 use crate::simulator::trial::trajectory::trajectory_csv;
+use crate::simulator_client::{ClientEvent, ClientOptions, ClientReport, ServerUrl, TimeMode, drive};
+use crate::statistics::quantile;
+use crate::udacity::{DecimalMark, NumberStyle};
 
 /// Put the built-in simulator in the place of Udacity's: it connects to a driving server, as `serve` is one
 #[derive(Debug, Args)]
@@ -185,11 +185,11 @@ pub fn run(args: SimArgs) -> Result<()> {
         laps: args.laps,
         seed: args.seed,
         start_mph: args.start_mph,
-        pace: if args.lockstep { Pace::Lockstep } else { Pace::RealTime { fps: args.fps } },
+        time_mode: if args.lockstep { TimeMode::Lockstep } else { TimeMode::RealTime { fps: args.fps } },
         numbers: match (args.term2, args.decimal_comma) {
-            (true, _) => Numbers::Json,
-            (_, true) => Numbers::Strings(DecimalMark::COMMA),
-            _ => Numbers::Strings(DecimalMark::DOT),
+            (true, _) => NumberStyle::Json,
+            (_, true) => NumberStyle::Strings(DecimalMark::COMMA),
+            _ => NumberStyle::Strings(DecimalMark::DOT),
         },
         manual_s: args.manual,
         scene_change_s: args.scene_change,

@@ -73,15 +73,8 @@ pub enum Column {
 
 impl Column {
     /// All columns, in the usual order of a log.
-    pub const ALL: [Column; 7] = [
-        Column::Center,
-        Column::Left,
-        Column::Right,
-        Column::Steering,
-        Column::Throttle,
-        Column::Brake,
-        Column::Speed,
-    ];
+    pub const ALL: [Column; 7] =
+        [Column::Center, Column::Left, Column::Right, Column::Steering, Column::Throttle, Column::Brake, Column::Speed];
 
     /// Name on the command line and in `steersman.toml`.
     pub fn name(self) -> &'static str {
@@ -237,6 +230,11 @@ pub fn parse_columns(text: &str) -> Result<BTreeMap<Column, ColumnRef>, String> 
 }
 
 impl Description {
+    /// Whether nothing is said.
+    pub fn is_empty(&self) -> bool {
+        *self == Description::default()
+    }
+
     /// These entries, and those of `other` where there is none here.
     pub fn or(mut self, other: Description) -> Description {
         let Description { columns, unit, full_lock_deg, hz, labels } = other;

@@ -87,7 +87,10 @@ fn find_deeper(store: &Store, path: &Path) -> Result<(&'static Format, PathBuf)>
         }
     }
     if store.is_file(&path.join("run.json")) || store.is_file(&path.join("model.safetensors")) {
-        return Err(Error::data(path, "is the folder of a run, no recording: name the model first, then the recordings"));
+        return Err(Error::data(
+            path,
+            "is the folder of a run, no recording: name the model first, then the recordings",
+        ));
     }
     Err(Error::data(
         path,

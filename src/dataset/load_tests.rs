@@ -2,8 +2,8 @@
 
 use super::*;
 use crate::dataset::recording::View;
-use crate::dataset::unusable::Reason;
 use crate::dataset::testing::{jpeg, recordings_folder, write_image};
+use crate::dataset::unusable::Reason;
 use std::fs;
 
 fn log(folder: &Path, text: &str) {
@@ -89,7 +89,10 @@ fn unusable_rows_are_counted_by_reason_with_examples() {
     // A missing side image costs that side sample, not its row.
     assert!(recording.rows.iter().any(|row| row.line == 5) && recording.rows.iter().any(|row| row.line == 7));
     let notices = recording.notices.join("\n");
-    assert!(notices.contains("1 pictures of the left camera cannot be used") && notices.contains("driving_log.csv:5: "), "{notices}");
+    assert!(
+        notices.contains("1 pictures of the left camera cannot be used") && notices.contains("driving_log.csv:5: "),
+        "{notices}"
+    );
     assert!(notices.contains("1 pictures of the right camera cannot be used"), "{notices}");
     assert!(recording.require_usable().is_ok());
     log(folder.path(), &format!("{text}{}", "x.jpg,y.jpg,z.jpg,0\n".repeat(4)));

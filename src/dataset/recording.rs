@@ -1,17 +1,16 @@
 //! What is known of a recording once it is read: rows, sessions, and what had to be left out.
 
+use super::formats::Format;
 use super::pictures::files::{Files, Name};
 use super::pictures::preprocess::Preprocessing;
-use super::formats::Format;
 use super::store::Store;
 use super::unusable::Unusable;
 use crate::picture::RgbImage;
 use crate::picture::decode::decode_rgb;
 use crate::{Error, Result};
-use serde::Serialize;
 use rayon::prelude::*;
+use serde::Serialize;
 use sha2::{Digest, Sha256};
-use std::hash::{DefaultHasher, Hash, Hasher};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
@@ -128,14 +127,10 @@ impl Recording {
 
     /// Reads the centre picture of every row and keeps a hash of it, so that [`split`](super::split::split) knows copies.
     pub fn hash_pictures(&mut self) {
-        let hash = |bytes: &mut Vec<u8>, row: usize| {
-            let mut hasher = DefaultHasher::new();
-            match self.read_picture(row, View::Centre, bytes) {
-                Ok(()) => bytes.hash(&mut hasher),
-                // Pictures that cannot be read are no copies of each other.
-                Err(_) => (row, self.path.as_os_str()).hash(&mut hasher),
-            }
-            hasher.finish()
+        let hash = |bytes: &mut Vec<u8>, row: usize| match self.read_picture(row, View::Centre, bytes) {
+            Ok(()) => fingerprint(bytes),
+            // Pictures that cannot be read are no copies of each other.
+            Err(_) => self.row_id(row),
         };
         self.picture_hashes = (0..self.rows.len()).into_par_iter().map_init(Vec::new, hash).collect();
     }
@@ -215,9 +210,7 @@ impl Recording {
     /// # Errors
     /// [`Error::Data`] if no row or less than 80 % of the rows can be used, with the reasons.
     pub fn require_usable(&self) -> Result<()> {
-        if let Some(trouble) = &self.unit_trouble {
-            return Err(Error::data(&self.path, trouble.as_str()));
-        }
+        self.require_unit()?;
         let (total, unusable) = (self.total_rows(), self.unusable.rows());
         if total == 0 {
             return Err(Error::data(&self.path, "the recording has no rows"));
@@ -246,6 +239,17 @@ impl Recording {
         let scaled = self.image_size.and_then(|size| preprocessing.size_notice(size));
         let all = self.notices.iter().cloned().chain(left_out).chain(scaled);
         all.map(|text| format!("{}: {text}", self.path.display())).collect()
+    }
+
+    /// Checks that the labels are shares of full lock, or that the user has said what they are.
+    ///
+    /// # Errors
+    /// [`Error::Data`] with the likely unit.
+    pub fn require_unit(&self) -> Result<()> {
+        match &self.unit_trouble {
+            Some(trouble) => Err(Error::data(&self.path, trouble.as_str())),
+            None => Ok(()),
+        }
     }
 
     /// Why the labels of the recording cannot be used as they are, if so.
@@ -304,6 +308,19 @@ impl Recording {
             }
         }
     }
+}
+
+/// A hash of `bytes` that is the same in every version of this program.
+fn fingerprint(bytes: &[u8]) -> u64 {
+    let mut hash = bytes.len() as u64;
+    let mut mix = |word: u64| {
+        hash = (hash ^ word).wrapping_mul(0x9e37_79b9_7f4a_7c15);
+        hash ^= hash >> 32;
+    };
+    let (words, rest) = bytes.as_chunks::<8>();
+    words.iter().for_each(|word| mix(u64::from_le_bytes(*word)));
+    rest.iter().for_each(|&byte| mix(u64::from(byte)));
+    hash
 }
 
 /// Last part of a path, for messages.

@@ -130,11 +130,6 @@ impl<'a> Rows<'a> {
         self.unit = self.said.unit.unwrap_or(unit);
     }
 
-    /// Rows a second where there are no plausible times, unless the user has named them.
-    pub fn set_hz(&mut self, hz: f64) {
-        self.assumed_hz = hz;
-    }
-
     /// Something the user should know.
     pub fn notice(&mut self, text: String) {
         self.notices.push(text);
@@ -359,7 +354,8 @@ impl Recording {
             if !rows.is_empty() && rows.iter().step_by(step).all(&mut is_copy) {
                 self.rows.iter_mut().for_each(|row| row.images[view as usize] = None);
                 let name = view.name();
-                self.notices.push(format!("the pictures of the {name} camera are copies of the centre ones: no {name} camera"));
+                self.notices
+                    .push(format!("the pictures of the {name} camera are copies of the centre ones: no {name} camera"));
             }
         }
     }

@@ -13,11 +13,12 @@ use crate::dataset::colour::Colour;
 use crate::dataset::preprocess::Preprocessing;
 use crate::dataset::resize::Interpolation;
 use crate::dataset::{Recording, View};
-use crate::engine::network::{InferencePlan, LayerSpec, Network, Parameters};
+use crate::engine::layers::Family;
+use crate::engine::network::{InferencePlan, Network, Parameters};
 use crate::engine::tensor::Shape;
 use crate::error::{Error, Result};
 use crate::metrics::correlation;
-use crate::picture::{RgbImage, decode::decode_rgb};
+use crate::picture::RgbImage;
 
 /// Kept rows of Udacity's picture, in projects of the field.
 const CROPS: [[usize; 2]; 12] = [
@@ -83,9 +84,7 @@ impl Frames {
         let mut chosen = [turned, straight].concat();
         chosen.sort_unstable();
         let read = |row: usize| -> Option<(RgbImage, f32)> {
-            let bytes = std::fs::read(recording.image_path(row, View::Centre)?).ok()?;
-            let mut image = RgbImage::default();
-            decode_rgb(&bytes, &mut image).ok()?;
+            let mut image = recording.picture(row, View::Centre)?;
             // All combinations begin by scaling the image to this size; so much of it is kept in memory.
             let whole = Preprocessing::default();
             if [image.height, image.width] != whole.source {
@@ -129,8 +128,8 @@ pub fn combinations(network: &Network) -> Vec<Preprocessing> {
         _ => &[],
     };
     // A network that scales by itself wants grey levels.
-    let first = network.layers().iter().find(|layer| !matches!(layer.spec, LayerSpec::Crop { .. }));
-    let scales_itself = first.is_some_and(|l| matches!(l.spec, LayerSpec::Scale { .. } | LayerSpec::BatchNorm { .. }));
+    let first = network.layers().iter().find(|layer| layer.spec.family() != Family::Rearrangement);
+    let scales_itself = first.is_some_and(|layer| layer.spec.family() == Family::Normalization);
     let scalings = if scales_itself { &SCALINGS[..1] } else { &SCALINGS[..] };
     let mut all = Vec::new();
     for colour in colours {
@@ -240,8 +239,8 @@ mod tests {
     #[test]
     fn the_colour_space_that_the_labels_follow_wins() {
         let layers = [
-            LayerSpec::Scale { factor: 1.0 / 255.0, offset: 0.0 },
-            LayerSpec::Dense { units: 1, init: Default::default() },
+            crate::engine::layers::ScaleSpec { factor: 1.0 / 255.0, offset: 0.0 }.into(),
+            crate::engine::layers::DenseSpec { units: 1, init: Default::default() }.into(),
         ];
         let network = Network::new(Shape::new(3, 4, 8), &layers, Isa::PORTABLE).unwrap();
         let mut parameters = network.initialize(1);

@@ -3,3 +3,4 @@
 pub mod atomic_file;
 pub mod new_folder;
 pub mod tar_archive;
+pub mod zip_archive;

@@ -72,7 +72,8 @@ pub fn begins_tar(head: &[u8]) -> bool {
 
 /// The checksum is the sum of the header's bytes, with spaces where it stands.
 fn checksum_fits(header: &[u8; BLOCK as usize]) -> bool {
-    let sum: u64 = header.iter().enumerate().map(|(i, &b)| u64::from(if (148..156).contains(&i) { b' ' } else { b })).sum();
+    let sum: u64 =
+        header.iter().enumerate().map(|(i, &b)| u64::from(if (148..156).contains(&i) { b' ' } else { b })).sum();
     number(&header[148..156]) == Some(sum)
 }
 

@@ -100,9 +100,8 @@ fn decode_jpeg(bytes: &[u8], max_side: usize, image: &mut RgbImage) -> Result<()
     }
     decoder.set_options(lenient.set_strict_mode(true));
     decoder.decode_into(&mut image.pixels).map_err(|error| match error {
-        zune_jpeg::errors::DecodeErrors::ExhaustedData | zune_jpeg::errors::DecodeErrors::FormatStatic("Premature end of buffer") => {
-            "the JPEG is truncated".into()
-        }
+        zune_jpeg::errors::DecodeErrors::ExhaustedData
+        | zune_jpeg::errors::DecodeErrors::FormatStatic("Premature end of buffer") => "the JPEG is truncated".into(),
         other => failed(other),
     })?;
     (image.height, image.width) = (height, width);
@@ -291,7 +290,10 @@ mod tests {
                         let cut = &whole[..begin + (scan.end - begin) * part / 10];
                         for marker in [&b""[..], b"\xff\xd9"] {
                             let cut = [cut, marker].concat();
-                            assert!(decode_rgb(&cut, &mut image).is_err(), "{part} of 10, {marker:?}, restart {restart}");
+                            assert!(
+                                decode_rgb(&cut, &mut image).is_err(),
+                                "{part} of 10, {marker:?}, restart {restart}"
+                            );
                         }
                     }
                 }

@@ -28,6 +28,6 @@ pub use data::Data;
 pub use history::{EpochRecord, read_history, write_history};
 pub use profile::ProfileReport;
 pub use run_folder::{RunFolder, RunInfo};
-pub use session::{TrainRequest, TrainResult, TrainingEvent, resume, train};
+pub use session::{TrainRequest, TrainResult, TrainingEvent, resume, resume_with, train};
 pub use transfer::TransferRequest;
 pub use validation::{Validation, ValidationResult};

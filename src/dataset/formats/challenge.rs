@@ -114,7 +114,9 @@ fn read(store: &Store, path: &Path, rows: &mut Rows) -> Result<()> {
             None => Err(format!("no row of {} fields with a time and an angle", header.len())),
         };
         match line {
-            Ok(()) => centre.last_mut().into_iter().filter(|entry| entry.line == 0).for_each(|entry| entry.line = number),
+            Ok(()) => {
+                centre.last_mut().into_iter().filter(|entry| entry.line == 0).for_each(|entry| entry.line = number)
+            }
             Err(detail) => rows.unusable(number, Reason::NotANumber, &detail),
         }
     }

@@ -36,9 +36,10 @@ fn names_of(column: Column) -> (&'static [&'static str], &'static [&'static str]
         ),
         Column::Left => (&["left", "left_image"], &["left"]),
         Column::Right => (&["right", "right_image"], &["right"]),
-        Column::Steering => {
-            (&["steering", "steering_angle", "steeringangle", "user/angle", "user/steering", "steer", "angle"], &["steer", "angle"])
-        }
+        Column::Steering => (
+            &["steering", "steering_angle", "steeringangle", "user/angle", "user/steering", "steer", "angle"],
+            &["steer", "angle"],
+        ),
         Column::Throttle => (&["throttle", "user/throttle"], &["throttle"]),
         Column::Brake => (&["brake", "reverse"], &["brake", "reverse"]),
         Column::Speed => (&["speed", "speed_mph"], &["speed"]),

@@ -115,7 +115,10 @@ fn read(store: &Store, folder: &Path, rows: &mut Rows) -> Result<()> {
     let style = Style::of(&some).ok_or_else(|| Error::data(folder, "the names of the pictures carry no labels"))?;
     if style == Style::Servo {
         rows.set_unit(Unit::Servo);
-        rows.notice("numbers at the end of names are taken for degrees of a servo, 90 is straight; say --unit if they are not".into());
+        rows.notice(
+            "numbers at the end of names are taken for degrees of a servo, 90 is straight; say --unit if they are not"
+                .into(),
+        );
     }
     for (i, name) in names.into_iter().enumerate() {
         let line = i as u32 + 1;
@@ -150,7 +153,12 @@ mod tests {
         assert_eq!((Style::of(&last), Style::Last.label(&last[0])), (Some(Style::Last), Some(-0.25)));
         let servo = names(&["video_001_090.png", "video_002_101.png", "video_003_085.png"]);
         assert_eq!((Style::of(&servo), Style::Servo.label(&servo[1])), (Some(Style::Servo), Some(101.0)));
-        for none in [names(&["IMG_001.jpg", "IMG_002.jpg"]), names(&["a.jpg"]), names(&[]), names(&["center_2016_12_01_13_30_48_287.jpg"])] {
+        for none in [
+            names(&["IMG_001.jpg", "IMG_002.jpg"]),
+            names(&["a.jpg"]),
+            names(&[]),
+            names(&["center_2016_12_01_13_30_48_287.jpg"]),
+        ] {
             assert_eq!(Style::of(&none), None, "{none:?}");
         }
         assert!(order("9_a.jpg") < order("10_a.jpg"));

@@ -15,8 +15,7 @@ struct Foreign {
 
 const MODEL: &str = "name the model first, then the recordings";
 const TABLE: &str = "save the sheet as CSV (comma separated), and name that file";
-const FRAMES: &str =
-    "a video alone has no labels: export its frames (ffmpeg -i FILE IMG/%06d.jpg) and write a CSV of picture names and steering";
+const FRAMES: &str = "a video alone has no labels: export its frames (ffmpeg -i FILE IMG/%06d.jpg) and write a CSV of picture names and steering";
 
 const KINDS: [Foreign; 13] = [
     Foreign {
@@ -50,7 +49,12 @@ const KINDS: [Foreign; 13] = [
         is: "a video",
         remedy: FRAMES,
     },
-    Foreign { magic: &[(0, b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1")], endings: &[".xls"], is: "an Excel workbook", remedy: TABLE },
+    Foreign {
+        magic: &[(0, b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1")],
+        endings: &[".xls"],
+        is: "an Excel workbook",
+        remedy: TABLE,
+    },
     Foreign { magic: &[], endings: &[".xlsx", ".ods"], is: "a spreadsheet", remedy: TABLE },
     Foreign {
         magic: &[(0, b"\x93NUMPY")],

@@ -91,7 +91,9 @@ fn only(folder: &Path, logs: Vec<PathBuf>) -> Result<Option<PathBuf>> {
 
 /// The table of formats in Markdown.
 pub fn table() -> String {
-    let mut text = String::from("| format | what marks it | labels and times | without times | cameras |\n|---|---|---|---|---|\n");
+    let mut text = String::from(
+        "| format | what marks it | labels and times | without times | cameras |\n|---|---|---|---|---|\n",
+    );
     for format in FORMATS {
         let Format { name, marks, labels, hz, cameras, .. } = format;
         text += &format!("| {name} | {marks} | {labels} | {hz} Hz | {cameras} |\n");

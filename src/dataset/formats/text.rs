@@ -43,10 +43,16 @@ impl Lines {
             let mut bytes = Vec::new();
             input.take(MAX_UTF16_BYTES + 1).read_to_end(&mut bytes)?;
             if bytes.len() as u64 > MAX_UTF16_BYTES {
-                return Err(io::Error::new(io::ErrorKind::FileTooLarge, "UTF-16 of more than 256 MiB: save it as UTF-8"));
+                return Err(io::Error::new(
+                    io::ErrorKind::FileTooLarge,
+                    "UTF-16 of more than 256 MiB: save it as UTF-8",
+                ));
             }
-            let of = |pair: &[u8]| if little { u16::from_le_bytes([pair[0], pair[1]]) } else { u16::from_be_bytes([pair[0], pair[1]]) };
-            let text: String = char::decode_utf16(bytes.chunks_exact(2).map(of)).map(|c| c.unwrap_or('\u{fffd}')).collect();
+            let of = |pair: &[u8]| {
+                if little { u16::from_le_bytes([pair[0], pair[1]]) } else { u16::from_be_bytes([pair[0], pair[1]]) }
+            };
+            let text: String =
+                char::decode_utf16(bytes.chunks_exact(2).map(of)).map(|c| c.unwrap_or('\u{fffd}')).collect();
             input = Box::new(Cursor::new(text.into_bytes()));
         }
         Ok(Lines { input, buffer: Vec::new(), number: 0 })

@@ -98,9 +98,14 @@ fn read(store: &Store, path: &Path, rows: &mut Rows) -> Result<()> {
     // No drive on a road turns the steering wheel by less than a degree all the time.
     if parsed.iter().all(|(_, line)| line.angle.abs() <= 1.0) {
         rows.set_unit(Unit::Lock);
-        rows.notice("all angles are within [-1, 1]: they are taken for shares of full lock; say --unit if they are not".into());
+        rows.notice(
+            "all angles are within [-1, 1]: they are taken for shares of full lock; say --unit if they are not".into(),
+        );
     } else if rows.said().unit.is_none() {
-        rows.notice("angles are taken for degrees of the steering wheel, 400 are full lock; say --unit or full_lock_deg if not".into());
+        rows.notice(
+            "angles are taken for degrees of the steering wheel, 400 are full lock; say --unit or full_lock_deg if not"
+                .into(),
+        );
     }
     for (line, Parsed { file, angle, time_ms }) in parsed {
         let source = split_path(&file).0.to_owned();

@@ -25,7 +25,9 @@ pub(super) const FORMAT: Format = Format {
     hz: 20.0,
     cameras: 1,
     find,
-    base: |store, folder| if store.is_folder(&folder.join("images")) { folder.join("images") } else { folder.to_path_buf() },
+    base: |store, folder| {
+        if store.is_folder(&folder.join("images")) { folder.join("images") } else { folder.to_path_buf() }
+    },
     read,
 };
 
@@ -100,10 +102,13 @@ pub(super) fn push(record: Record, line: u32, labels: Labels, counts: &mut Count
         counts.deleted += 1;
         return Ok(());
     }
-    let driven_by_user = record.mode.as_deref().is_none_or(|mode| mode.trim().is_empty() || mode.trim().eq_ignore_ascii_case("user"));
+    let driven_by_user =
+        record.mode.as_deref().is_none_or(|mode| mode.trim().is_empty() || mode.trim().eq_ignore_ascii_case("user"));
     let (angle, throttle) = match labels {
         Labels::User if driven_by_user => (record.angle.or(record.steering), record.throttle),
-        Labels::Pilot if record.pilot_angle.is_some() => (record.pilot_angle, record.pilot_throttle.or(record.throttle)),
+        Labels::Pilot if record.pilot_angle.is_some() => {
+            (record.pilot_angle, record.pilot_throttle.or(record.throttle))
+        }
         _ => {
             counts.other_driver += 1;
             return Ok(());
@@ -152,11 +157,18 @@ fn catalogs(store: &Store, folder: &Path) -> Result<Vec<String>> {
 fn contents(store: &Store, folder: &Path, rows: &mut Rows) -> Result<(Vec<String>, BTreeSet<u64>)> {
     let path = folder.join("manifest.json");
     let there = catalogs(store, folder)?;
-    let text = if store.is_file(&path) { store.read_text(&path, MAX_MANIFEST_BYTES).map_err(Error::io(&path))? } else { String::new() };
+    let text = if store.is_file(&path) {
+        store.read_text(&path, MAX_MANIFEST_BYTES).map_err(Error::io(&path))?
+    } else {
+        String::new()
+    };
     let contents = text.lines().find_map(|line| serde_json::from_str::<Contents>(line).ok());
     let Some(Contents { mut paths, deleted_indexes }) = contents else {
         if there.is_empty() {
-            return Err(Error::data(&path, "no line lists the catalogs (`paths`), and there are none: not a donkeycar tub of format 2"));
+            return Err(Error::data(
+                &path,
+                "no line lists the catalogs (`paths`), and there are none: not a donkeycar tub of format 2",
+            ));
         }
         let what = if text.is_empty() { "there is no manifest.json" } else { "manifest.json is damaged" };
         rows.notice(format!(
@@ -172,7 +184,11 @@ fn contents(store: &Store, folder: &Path, rows: &mut Rows) -> Result<(Vec<String
     }
     let unlisted: Vec<String> = there.into_iter().filter(|name| !paths.contains(name)).collect();
     if !unlisted.is_empty() {
-        rows.notice(format!("manifest.json does not list {}, which {} read all the same", unlisted.join(", "), if unlisted.len() == 1 { "is" } else { "are" }));
+        rows.notice(format!(
+            "manifest.json does not list {}, which {} read all the same",
+            unlisted.join(", "),
+            if unlisted.len() == 1 { "is" } else { "are" }
+        ));
         paths.extend(unlisted);
     }
     Ok((paths, deleted_indexes.unwrap_or_default()))
@@ -195,13 +211,19 @@ fn read(store: &Store, folder: &Path, rows: &mut Rows) -> Result<()> {
         let (mut text, mut line) = (Vec::new(), 0);
         loop {
             text.clear();
-            let read = std::io::Read::take(&mut input, MAX_LINE_BYTES + 1).read_until(b'\n', &mut text).map_err(Error::io(&path))?;
+            let read = std::io::Read::take(&mut input, MAX_LINE_BYTES + 1)
+                .read_until(b'\n', &mut text)
+                .map_err(Error::io(&path))?;
             if read == 0 {
                 break;
             }
             line += 1;
             if text.len() as u64 > MAX_LINE_BYTES {
-                return Err(Error::data_at(&path, u64::from(line), "the record is longer than 1 MiB: no catalog of a tub"));
+                return Err(Error::data_at(
+                    &path,
+                    u64::from(line),
+                    "the record is longer than 1 MiB: no catalog of a tub",
+                ));
             }
             if text.trim_ascii().is_empty() {
                 continue;

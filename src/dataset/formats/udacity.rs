@@ -120,7 +120,9 @@ fn find(store: &Store, path: &Path) -> Result<Option<PathBuf>> {
         let columns = BTreeMap::new();
         let mut log = Log::new(lines, &columns);
         (0..LOOKED_AT).any(|_| match log.next() {
-            Ok(Some(Line::Row(entry))) => entry.images[0].as_deref().is_some_and(|image| is_picture_name(&image.to_lowercase())),
+            Ok(Some(Line::Row(entry))) => {
+                entry.images[0].as_deref().is_some_and(|image| is_picture_name(&image.to_lowercase()))
+            }
             // A log all of whose rows are wrong is a log, if it was named; so is one whose columns cannot be told apart.
             Ok(Some(Line::Unusable { reason, .. })) => named && reason != Reason::TooFewFields,
             Err(message) => named || !message.starts_with("no column is known to hold picture"),
@@ -191,9 +193,11 @@ pub(super) fn split_fields(text: &str, separator: char) -> Vec<&str> {
 
 fn is_image(field: &str) -> bool {
     let field = field.trim().trim_matches('"');
-    field.len() >= 4 && field.get(field.len().saturating_sub(5)..).or(Some(field)).is_some_and(|end| {
-        is_picture_name(&end.to_ascii_lowercase())
-    })
+    field.len() >= 4
+        && field
+            .get(field.len().saturating_sub(5)..)
+            .or(Some(field))
+            .is_some_and(|end| is_picture_name(&end.to_ascii_lowercase()))
 }
 
 /// A header has words where rows have images and numbers.
@@ -329,10 +333,8 @@ pub(crate) fn time_of(file: &str) -> Option<i64> {
     let mut parts = stem.rsplit('_').map(|part| part.parse::<i64>().ok());
     let mut next = || parts.next().flatten();
     let [ms, second, minute, hour, day, month, year] = [next()?, next()?, next()?, next()?, next()?, next()?, next()?];
-    let fits = (0..1000).contains(&ms)
-        && (0..=60).contains(&second)
-        && (0..60).contains(&minute)
-        && (0..24).contains(&hour);
+    let fits =
+        (0..1000).contains(&ms) && (0..=60).contains(&second) && (0..60).contains(&minute) && (0..24).contains(&hour);
     let days = days_of(year, month, day)?;
     fits.then_some((((days * 24 + hour) * 60 + minute) * 60 + second) * 1000 + ms)
 }
@@ -441,7 +443,9 @@ mod tests {
         assert_eq!(row("c.jpg;l.jpg;r.jpg;-0,25;0,5;0;9,5"), plain);
         assert_eq!(row("c.jpg\tl.jpg\tr.jpg\t-0.25\t0.5\t0\t9.5"), plain);
         let header = "center,left,right,steering,throttle,brake,speed,lap,position";
-        let Line::Row(entry) = &lines(&format!("{header}\nc.jpg,l.jpg,r.jpg,-0.25,0.5,0,9.5,3,12.5"))[0] else { panic!() };
+        let Line::Row(entry) = &lines(&format!("{header}\nc.jpg,l.jpg,r.jpg,-0.25,0.5,0,9.5,3,12.5"))[0] else {
+            panic!()
+        };
         assert_eq!(Entry { line: 1, ..entry.clone() }, plain);
     }
 

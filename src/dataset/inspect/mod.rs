@@ -8,8 +8,8 @@ mod suspicious;
 use crate::Result;
 use crate::dataset::description::Description;
 use crate::dataset::load::load_with;
-use crate::dataset::rows::ImageCheck;
 use crate::dataset::recording::{Recording, Row, View};
+use crate::dataset::rows::ImageCheck;
 use crate::dataset::unusable::{Reason, Unusable};
 use crate::observer::{Observer, Progress};
 use crate::text::escaped;
@@ -199,12 +199,8 @@ impl Spread {
 /// read, the log alone is described. `observer` is told the share of the pictures that is done.
 ///
 /// # Errors
-/// As [`super::load_with`]; the observer's own.
-pub fn inspect(
-    path: &Path,
-    said: &Description,
-    observer: &mut (dyn Observer<Progress> + Send),
-) -> Result<Inspection> {
+/// As [`load_with`](super::load_with); the observer's own.
+pub fn inspect(path: &Path, said: &Description, observer: &mut (dyn Observer<Progress> + Send)) -> Result<Inspection> {
     let checked = load_with(path, said, ImageCheck::Verify)?;
     if checked.rows.is_empty() && checked.total_rows() > 0 {
         let log_alone = load_with(path, said, ImageCheck::Skip)?;

@@ -1,8 +1,8 @@
 //! The image files of a recording: finding them, checking them, and remembering them in few bytes.
 
+use crate::Result as Outcome;
 use crate::dataset::store::{Kind, Store};
 use crate::dataset::unusable::Reason;
-use crate::Result as Outcome;
 use crate::picture::RgbImage;
 use crate::picture::decode::{decode_rgb, ends_complete, starts_as_image};
 use std::collections::HashMap;
@@ -177,7 +177,8 @@ impl<'a> Locator<'a> {
                 Ok(()) => return Ok((folder, file.to_owned())),
             }
         }
-        let path = self.by_name(written, file).map_err(|message| (Reason::ImageMissing, message))?.ok_or_else(missing)?;
+        let path =
+            self.by_name(written, file).map_err(|message| (Reason::ImageMissing, message))?.ok_or_else(missing)?;
         let (Some(folder), Some(name)) = (path.parent(), path.file_name().and_then(|name| name.to_str())) else {
             return Err(missing());
         };

@@ -4,14 +4,17 @@ use std::path::Path;
 
 use super::film::Video;
 use super::onlooker::Onlooker;
-use super::painter::{Captions, FilmFrame, Painter};
+use super::painter::{Captions, FilmFrame, FilmScales, Painter};
 use super::summary::VideoSummary;
 use crate::error::{Error, Result};
 use crate::observer::{Observer, Progress};
 use crate::picture::RgbImage;
 use crate::simulator::car::dynamics::MAX_STEER_DEG;
-use crate::simulator::trial::run::{DRIVE_HZ, Failure};
-use crate::simulator::{DriveEvent, DriveFrame, Driver, HEIGHT, Run, RunOptions, Track, WIDTH, run_observed};
+use crate::simulator::car::expert::pursuit;
+use crate::simulator::trial::outcome::{DRIVE_HZ, Failure};
+use crate::simulator::{
+    DriveEvent, DriveFrame, Driver, HEIGHT, Simulation, Track, Trial, TrialOptions, WIDTH, run_trial_observed,
+};
 
 /// A video of a run that is yet to be driven.
 pub struct DriveVideo {
@@ -43,12 +46,17 @@ impl DriveVideo {
         fps: Option<f64>,
         onlooker: Option<Onlooker>,
     ) -> Result<DriveVideo> {
-        let video = Video::create(path, Painter::new(names, Some(track)), fps.unwrap_or(DRIVE_HZ as f64))?;
+        let saliency = onlooker.as_ref().is_some_and(Onlooker::colours);
+        let video = Video::create(
+            path,
+            Painter::new(names, scales(track), Some(track), saliency),
+            fps.unwrap_or(DRIVE_HZ as f64),
+        )?;
         let frame = FilmFrame { picture: RgbImage::filled(HEIGHT, WIDTH, [0; 3]), ..FilmFrame::default() };
         Ok(DriveVideo { video, frame, onlooker })
     }
 
-    /// Drives the run `seed`, as [`run`](crate::simulator::trial::run::run) does and to the same bits, and writes the video. `observer`
+    /// Drives the run `seed`, as [`run`](crate::simulator::trial::run::run_trial) does and to the same bits, and writes the video. `observer`
     /// is told the share of the way that is made. If it returns [`Error::Interrupted`], what there is by then is written, and the
     /// second value is `true`.
     ///
@@ -59,12 +67,12 @@ impl DriveVideo {
         mut self,
         track: &Track,
         driver: &mut dyn Driver,
-        options: &RunOptions,
+        options: &TrialOptions,
         seed: u64,
         observer: &mut dyn Observer<Progress>,
     ) -> Result<(VideoSummary, bool)> {
         let looks = driver.needs_frame();
-        match run_observed(track, driver, options, seed, &mut FilmObserver { film: &mut self, looks, observer }) {
+        match run_trial_observed(track, driver, options, seed, &mut FilmObserver { film: &mut self, looks, observer }) {
             Ok(run) => Ok((self.video.finish(&outcome(&run, options))?, false)),
             Err(Error::Interrupted) => Ok((self.video.finish("stopped")?, true)),
             Err(error) => Err(error),
@@ -104,8 +112,17 @@ impl FilmObserver<'_> {
     }
 }
 
+/// Scales for a drive on `track` that is yet to come: those that the expert needs. Its car is a metre from the line at most.
+fn scales(track: &Track) -> FilmScales {
+    let angles = track.stations.iter().step_by(5).map(|station| {
+        let heading_deg = station.ty.atan2(station.tx).to_degrees();
+        pursuit(&Simulation::posed(track, [station.x, station.y], heading_deg, 10.0)) * MAX_STEER_DEG
+    });
+    FilmScales { darkest_m: 1.0, ..FilmScales::covering(angles, [].into_iter()) }
+}
+
 /// What a run came to, in a few words.
-fn outcome(run: &Run, options: &RunOptions) -> String {
+fn outcome(run: &Trial, options: &TrialOptions) -> String {
     let time_s = run.time_s;
     match run.failure {
         Some(Failure::Crash) => format!("hit a wall after {time_s:.1} s"),
