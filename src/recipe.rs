@@ -26,7 +26,7 @@ use crate::suggestion::did_you_mean;
 /// Name and text of each recipe that is built in, by name.
 pub const SHIPPED: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/recipes.rs"));
 
-/// Longer networks are refused.
+/// Maximum of layers of a network.
 const MAX_LAYERS: usize = 1000;
 
 /// A whole experiment.
@@ -45,7 +45,7 @@ pub struct Recipe {
     /// Angle of the front wheels at steering 1, in degrees; turns errors into degrees.
     #[serde(default = "default_full_lock_deg")]
     pub full_lock_deg: f64,
-    /// What training makes small.
+    /// The function that training minimizes.
     #[serde(default)]
     pub loss: Loss,
     /// Gradients with a larger L2 norm are scaled down to this one.
@@ -73,14 +73,14 @@ pub struct Recipe {
     /// Training side and validation side.
     #[serde(default)]
     pub split: SplitSpec,
-    /// How parameters follow the gradient.
+    /// The algorithm that updates the parameters.
     pub optimizer: OptimizerSpec,
-    /// How the learning rate changes.
+    /// The learning-rate schedule.
     #[serde(default)]
     pub schedule: ScheduleSpec,
 }
 
-/// Ends a run when the validation loss has stopped to fall; the best weights are kept.
+/// Ends a run when the validation loss stops falling; the best weights become the model.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct EarlyStopping {

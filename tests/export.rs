@@ -144,7 +144,10 @@ fn compare(model: &Model, language: &str, file: &str, compile: &dyn Fn(&Path) ->
     assert_eq!(lines.next().unwrap().parse(), Ok(model.recipe.full_lock_deg), "{name}");
     let answers: Vec<f32> = lines.map(|line| line.parse().unwrap()).collect();
     assert_eq!(answers.len(), pictures.len(), "{name}");
-    let expected: Vec<f32> = pictures.iter().map(|picture| pilot.steer(h, w, picture).unwrap()).collect();
+    let expected: Vec<f32> = pictures
+        .iter()
+        .map(|picture| pilot.steer(ndarray::ArrayView3::from_shape((h, w, 3), picture).unwrap()).unwrap())
+        .collect();
     for (number, (answer, expected)) in answers.iter().zip(&expected).enumerate() {
         let error = (answer - expected).abs() / expected.abs().max(1.0);
         assert!(error <= BOUND, "{name} as {language}, picture {number}: {answer} instead of {expected}");

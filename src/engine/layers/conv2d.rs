@@ -99,12 +99,12 @@ impl Conv2d {
     }
 
     /// The convolution kernel.
-    pub(super) fn kernel(&self) -> &Conv {
+    pub(crate) fn kernel(&self) -> &Conv {
         &self.conv
     }
 
     /// `params` as weight and bias.
-    pub(super) fn split<'a>(&self, params: &'a [f32]) -> (&'a [f32], &'a [f32]) {
+    pub(crate) fn split<'a>(&self, params: &'a [f32]) -> (&'a [f32], &'a [f32]) {
         params.split_at(self.weight_len())
     }
 
