@@ -265,9 +265,10 @@ mod tests {
         let aside = ViewWarp::new(&udacity(), whole(), 0.0, Offset { right_m: 1.0, ..Offset::default() });
         assert_eq!(aside.source(100.0, 10.0).map(|(x, _)| (x * 1e6).round() / 1e6), Some(100.0));
         let turned = ViewWarp::new(&udacity(), whole(), 0.0, Offset { turn: 0.1, ..Offset::default() });
-        // A car turned to the right sees at column 100 what was to the right of it: about 0.1 rad * 138.6 pixels.
+        // A car turned to the right sees at column 100, 23.4 deg left of the axis, what was 0.1 rad to the right of that.
         let (column, _) = turned.source(100.0, 56.0).unwrap();
-        assert!((column - 113.0).abs() < 3.0, "{column}");
+        let expected = 160.0 + 138.564 * ((-60.0f64 / 138.564).atan() + 0.1).tan();
+        assert!((column - expected).abs() < 2.0, "{column} {expected}");
     }
 
     #[test]
