@@ -8,11 +8,13 @@ use criterion::measurement::WallTime;
 use criterion::{BenchmarkGroup, Criterion, Throughput, criterion_group, criterion_main};
 use std::hint::black_box;
 use std::time::{Duration, Instant};
-use steersman_kernels::conv::{Conv, ConvShape};
+use steersman_kernels::conv::{Conv, ConvAlgorithm, ConvShape};
 use steersman_kernels::gemm::{gemm, gemm_scratch_len};
+use steersman_kernels::matrix::{Matrix, MatrixMut};
 use steersman_kernels::norm_rectify::{self, ChannelMeans, ChannelStatistics, RectifyShape, Slopes};
 use steersman_kernels::pool::PoolShape;
-use steersman_kernels::{Isa, activation, baseline, norm, peak, pool, update};
+use steersman_kernels::sgemm::sgemm;
+use steersman_kernels::{Backend, Isa, activation, norm, peak, pool, update};
 
 /// Images in a call: one shard of a training batch.
 const IMAGES: usize = 8;
@@ -93,25 +95,28 @@ fn convolutions(criterion: &mut Criterion) {
         product(&mut group, "forward", operations, peak, || {
             conv.forward(IMAGES, black_box(&x), &weight, &bias, &mut y, &mut scratch);
         });
-        product(&mut group, "forward by im2col and matrixmultiply", operations, peak, || {
-            baseline::conv_forward(&shape, IMAGES, black_box(&x), &weight, &bias, &mut y);
-        });
         product(&mut group, "backward_input", operations, peak, || {
             conv.backward_input(IMAGES, black_box(&dy), &weight, &mut dx, &mut scratch);
         });
         // As in a training step, where weights are packed once for all shards.
-        let (mut packed, mut packed_gradient) = (vec![0.0; conv.packed_len()], vec![0.0; conv.packed_gradient_len()]);
-        conv.pack(&weight, &bias, &mut packed);
-        conv.pack_gradient(&weight, &mut packed_gradient);
-        product(&mut group, "forward_packed", operations, peak, || {
-            conv.forward_packed(IMAGES, black_box(&x), &packed, &mut y, &mut scratch);
-        });
-        product(&mut group, "backward_input_packed", operations, peak, || {
-            conv.backward_input_packed(IMAGES, black_box(&dy), &packed_gradient, &mut dx, &mut scratch);
-        });
-        product(&mut group, "backward_weight", operations, peak, || {
-            conv.backward_weight(IMAGES, black_box(&x), &dy, &mut dweight, &mut dbias, &mut scratch);
-        });
+        for conv in [Conv::new(shape, isa), Conv::new(shape, Backend { isa, conv: ConvAlgorithm::Im2col })] {
+            let name =
+                |pass: &str| format!("{pass}{}", if conv.algorithm() == ConvAlgorithm::Auto { "" } else { ", im2col" });
+            let mut scratch = vec![0.0; conv.scratch_len()];
+            let (mut packed, mut packed_gradient) =
+                (vec![0.0; conv.packed_len()], vec![0.0; conv.packed_gradient_len()]);
+            conv.pack(&weight, &bias, &mut packed);
+            conv.pack_gradient(&weight, &mut packed_gradient);
+            product(&mut group, &name("forward_packed"), operations, peak, || {
+                conv.forward_packed(IMAGES, black_box(&x), &packed, &mut y, &mut scratch);
+            });
+            product(&mut group, &name("backward_input_packed"), operations, peak, || {
+                conv.backward_input_packed(IMAGES, black_box(&dy), &packed_gradient, &mut dx, &mut scratch);
+            });
+            product(&mut group, &name("backward_weight"), operations, peak, || {
+                conv.backward_weight(IMAGES, black_box(&x), &dy, &mut dweight, &mut dbias, &mut scratch);
+            });
+        }
         group.finish();
     }
 }
@@ -129,24 +134,17 @@ fn products(criterion: &mut Criterion) {
             ];
             for (name, (m, k, n), a_strides, b_strides) in sizes {
                 let (a, b, mut c) = (vec![0.1; m * k], vec![0.1; k * n], vec![0.0; m * n]);
+                let a = Matrix { values: &a, rows: m, columns: k, strides: a_strides };
+                let b = Matrix { values: &b, rows: k, columns: n, strides: b_strides };
                 let mut scratch = vec![0.0; gemm_scratch_len(m, k, n)];
                 let mut group = criterion.benchmark_group(format!("{layer} {images}x{inputs}-{outputs} {name}"));
                 let operations = 2 * (m * k * n) as u64;
                 product(&mut group, "gemm", operations, peak, || {
-                    let (a, c_strides) = (black_box(&a), (n, 1));
-                    gemm(isa, m, k, n, 1.0, a, a_strides, &b, b_strides, 0.0, &mut c, c_strides, &mut scratch);
+                    gemm(isa, 1.0, black_box(a), b, 0.0, MatrixMut::new(&mut c, m, n), &mut scratch);
                 });
-                // The rival: it allocates its packing buffers in every call.
-                let view = |data: &[f32], rows, columns, strides: (usize, usize)| {
-                    let shape = ndarray::ShapeBuilder::strides((rows, columns), strides);
-                    ndarray::ArrayView2::from_shape(shape, data).map(|view| view.to_owned()).ok()
-                };
-                if let (Some(a), Some(b)) = (view(&a, m, k, a_strides), view(&b, k, n, b_strides)) {
-                    let mut c = ndarray::Array2::<f32>::zeros((m, n));
-                    product(&mut group, "ndarray (matrixmultiply)", operations, peak, || {
-                        ndarray::linalg::general_mat_mul(1.0, black_box(&a), &b, 0.0, &mut c);
-                    });
-                }
+                product(&mut group, "sgemm (matrixmultiply)", operations, peak, || {
+                    sgemm(black_box(a), b, 0.0, MatrixMut::new(&mut c, m, n));
+                });
                 group.finish();
             }
         }
@@ -189,7 +187,7 @@ fn rectified(criterion: &mut Criterion) {
     }
 }
 
-/// A convolution behind a 4x4 pooling: the pooling with its places, and the gradients from those alone.
+/// A convolution behind a 4x4 pooling: the pooling with its argmax, and the gradients from those alone.
 fn pooled_convolutions(criterion: &mut Criterion) {
     let isa = Isa::best();
     let peak = peak::measure_peak_gflops(isa, 0.5);
@@ -203,21 +201,21 @@ fn pooled_convolutions(criterion: &mut Criterion) {
         let map: Vec<f32> =
             (0..IMAGES * oc * shape.out_h() * shape.out_w()).map(|i| (i * 7919 % 1000) as f32).collect();
         let pooled = IMAGES * oc * pool_shape.out_h() * pool_shape.out_w();
-        let (mut y, mut places, dy) = (vec![0.0; pooled], vec![0; pooled], vec![0.5; pooled]);
+        let (mut y, mut argmax, dy) = (vec![0.0; pooled], vec![0; pooled], vec![0.5; pooled]);
         let (x, weight) = (vec![0.5; IMAGES * c * h * w], vec![0.1; oc * c * kh * kw]);
         let (mut dx, mut dweight, mut dbias) = (x.clone(), weight.clone(), vec![0.0; oc]);
         let mut group = criterion.benchmark_group(format!("pooled conv {name}"));
         group.throughput(Throughput::Bytes(4 * (map.len() + 2 * pooled) as u64));
-        group.bench_function("max_forward_with_places", |b| {
-            b.iter(|| pool::max_forward_with_places(isa, &pool_shape, IMAGES, w, black_box(&map), &mut y, &mut places));
+        group.bench_function("max_forward_with_argmax", |b| {
+            b.iter(|| pool::max_forward_with_argmax(isa, &pool_shape, IMAGES, w, black_box(&map), &mut y, &mut argmax));
         });
         // Of the positions that have a gradient: a 16th of all.
         let operations = 2 * (pooled * c * kh * kw) as u64;
         product(&mut group, "sparse_backward_weight", operations, peak, || {
-            conv.sparse_backward_weight(IMAGES, black_box(&x), &places, &dy, &mut dweight, &mut dbias);
+            conv.sparse_backward_weight(IMAGES, black_box(&x), &argmax, &dy, &mut dweight, &mut dbias);
         });
         product(&mut group, "sparse_backward_input", operations, peak, || {
-            conv.sparse_backward_input(IMAGES, &places, black_box(&dy), &weight, &mut dx);
+            conv.sparse_backward_input(IMAGES, &argmax, black_box(&dy), &weight, &mut dx);
         });
         group.finish();
     }

@@ -1,7 +1,7 @@
 //! From a file's bytes to network input, one image on one thread, for each shipped recipe.
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
-use steersman::dataset::decode::{RgbImage, decode_rgb};
+use steersman::picture::{RgbImage, decode::decode_rgb};
 use steersman::recipe::{Recipe, SHIPPED};
 
 fn loader(c: &mut Criterion) {

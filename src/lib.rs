@@ -6,8 +6,8 @@
 //! A frame's way to the wheels: [`dataset`] reads a recording, splits it *before* anything is augmented, decodes each image
 //! once and preprocesses it; a [`recipe`] says how, and what network to train; [`network`](engine::network) plans the buffers of its
 //! [`layers`](engine::layers) and runs them; [`training`] goes through the epochs, follows the gradient with an [`optimizer`](engine::optimizer) and writes the
-//! run folder; [`model_file`] is what remains; a [`pilot`] loads it and steers. [`report`] measures how well it predicts,
-//! and [`simulator`] how well it drives; [`live`] shows a drive in a browser, and lets a person drive there; [`exchange`] reads
+//! run folder; [`model_file`] is what remains; a [`pilot`] loads it and steers. [`metrics`] measure how well it predicts,
+//! and [`simulator`] how well it drives; [`report`] shows both on pages and in films; [`live`] shows a drive in a browser, and lets a person drive there; [`exchange`] reads
 //! models of other programs and writes ours down for them. [`cli`] is the command line.
 //!
 //! Dependencies point one way: `steersman-kernels` (all vector code and every `unsafe` line) ← [`tensor`](engine::tensor) ← [`layers`](engine::layers) ←
@@ -42,21 +42,9 @@
 //! A recording is a folder with a `driving_log.csv`, or a donkeycar tub; `data/sample` is a very short one.
 //!
 //! ```
-//! use std::sync::atomic::AtomicBool;
+//! use steersman::observer::StopSignal;
 //! use steersman::recipe::Recipe;
-//! use steersman::training::{EpochRecord, Observer, TrainRequest, train};
-//!
-//! struct Printer;
-//!
-//! impl Observer for Printer {
-//!     fn notice(&mut self, text: &str) {
-//!         println!("{text}");
-//!     }
-//!     fn progress(&mut self, _epoch: u32, _images: usize, _of: usize, _loss: f64) {}
-//!     fn epoch(&mut self, record: &EpochRecord, of: u32) {
-//!         println!("epoch {} of {of}: loss {:.4}", record.epoch, record.train_loss);
-//!     }
-//! }
+//! use steersman::training::{TrainRequest, TrainingEvent, train};
 //!
 //! # let folder = tempfile::tempdir().unwrap();
 //! # let out = folder.path().join("run");
@@ -65,9 +53,19 @@
 //! # */
 //! // The recipe is the experiment: preprocessing, network, split, optimizer. A path ending in .toml names one of your own.
 //! let recipe = Recipe::find("lenet", &["epochs=2".into(), "batch=16".into()])?;
-//! let request = TrainRequest { recordings: vec!["data/sample".into()], recipe, out, seed: 1, cache_mib: 64, from: None };
-//! let stop = AtomicBool::new(false); // set from elsewhere, it ends the run after the current batch
-//! let result = train(request, &mut Printer, &stop)?;
+//! let recordings = vec!["data/sample".into()];
+//! let (from, algorithm, profile) = (None, None, false);
+//! let request = TrainRequest { recordings, recipe, out, seed: 1, cache_mib: 64, from, algorithm, profile };
+//! let stop = StopSignal::default(); // requested from elsewhere, it ends the run after the current batch
+//! let mut observer = |event| {
+//!     match event {
+//!         TrainingEvent::Notice(text) => println!("{text}"),
+//!         TrainingEvent::Batch { .. } => {}
+//!         TrainingEvent::Epoch { record, of } => println!("epoch {} of {of}: loss {:.4}", record.epoch, record.train_loss),
+//!     }
+//!     Ok(())
+//! };
+//! let result = train(request, &mut observer, &stop)?;
 //! println!("{}: mean squared error {:?} on the validation side", result.model.display(), result.val_mse);
 //! # assert!(result.model.is_file() && result.epochs == 2);
 //! # Ok::<(), steersman::Error>(())
@@ -159,14 +157,21 @@ pub mod files;
 pub mod geometry;
 pub mod live;
 pub mod main_job;
+pub mod metrics;
 pub mod model_file;
 mod net;
+pub mod observer;
+pub mod picture;
 pub mod pilot;
 pub mod recipe;
 pub mod replay;
 pub mod report;
 pub mod serve;
 pub mod simulator;
+pub mod simulator_client;
+mod statistics;
+mod text;
 pub mod training;
+pub mod udacity;
 
 pub use error::{Error, Result};

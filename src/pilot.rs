@@ -5,11 +5,14 @@ use std::sync::Arc;
 
 use steersman_kernels::Isa;
 
-use crate::dataset::decode::{MAX_SIDE, RgbImage, decode_rgb_within};
 use crate::dataset::preprocess::Preprocessor;
 use crate::engine::network::{InferencePlan, Network, ObservationPlan, Parameters};
 use crate::error::{Error, Result};
 use crate::model_file::Model;
+use crate::picture::{
+    RgbImage,
+    decode::{MAX_SIDE, decode_rgb_within},
+};
 use crate::recipe::Recipe;
 use crate::simulator::{DriveState, Driver, HEIGHT, RgbFrame, WIDTH};
 

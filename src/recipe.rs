@@ -10,7 +10,7 @@
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
-use steersman_kernels::Isa;
+use steersman_kernels::{Backend, Isa};
 
 use crate::dataset::augment::Augmentation;
 use crate::dataset::preprocess::Preprocessing;
@@ -171,14 +171,14 @@ impl Recipe {
         toml::to_string(self).map_err(|e| Error::Recipe { recipe: self.name.clone(), message: e.to_string() })
     }
 
-    /// The network of the recipe.
+    /// The network of the recipe, computed with `backend`: an [`Isa`], or one with a convolution algorithm.
     ///
     /// # Errors
     ///
     /// [`Error::Network`] if a layer does not fit.
-    pub fn network(&self, isa: Isa) -> Result<Network> {
+    pub fn network(&self, backend: impl Into<Backend>) -> Result<Network> {
         let [c, h, w] = self.preprocessing.output();
-        let network = Network::new(Shape::new(c, h, w), &self.layers, isa)?;
+        let network = Network::new(Shape::new(c, h, w), &self.layers, backend)?;
         if network.layers().iter().all(|l| l.layer.is_view()) {
             let message = "a network needs a layer that computes something".into();
             return Err(Error::Network { layer: "(all)".into(), message });

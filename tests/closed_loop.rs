@@ -4,25 +4,17 @@
 #![cfg(not(debug_assertions))]
 
 use std::path::Path;
-use std::sync::atomic::{AtomicBool, Ordering};
 
 use steersman::Error;
-use steersman::main_job::experiment::{self, Plan, Subject, write_csv};
-use steersman::main_job::job::{Job, JobNote, JobRequest, Scope, Stages};
+use steersman::main_job::experiment::{self, ExperimentEvent, Plan, Subject, write_csv};
+use steersman::main_job::job::{Job, JobEvent, JobNote, JobRequest, Scope};
 use steersman::main_job::training_set::{Take, recordings};
 use steersman::main_job::{TrackResult, test_on_track};
+use steersman::observer::{StopSignal, Unobserved};
 use steersman::pilot::Pilot;
 use steersman::recipe::Recipe;
 use steersman::simulator::{DriveOptions, Driver, Track, Zero, drive};
-use steersman::training::{EpochRecord, Observer, TrainRequest, TrainResult, train};
-
-struct Silent;
-
-impl Observer for Silent {
-    fn notice(&mut self, _: &str) {}
-    fn progress(&mut self, _: u32, _: usize, _: usize, _: f64) {}
-    fn epoch(&mut self, _: &EpochRecord, _: u32) {}
-}
+use steersman::training::{TrainRequest, TrainResult, TrainingEvent, train};
 
 fn learn(folder: &Path, threads: usize) -> (TrainResult, TrackResult) {
     let take = |reverse, recovery, seed| Take { track: "lake".into(), laps: 0.15, reverse, recovery, seed };
@@ -31,17 +23,19 @@ fn learn(folder: &Path, threads: usize) -> (TrainResult, TrackResult) {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
     pool.install(|| {
         let request = TrainRequest {
-            recordings: recordings(&folder.join("recordings"), &takes, &|_| true).unwrap().0,
+            recordings: recordings(&folder.join("recordings"), &takes, &mut Unobserved).unwrap().0,
             recipe: Recipe::find("lenet", &overrides).unwrap(),
             out: folder.join(format!("run-{threads}")),
             seed: 1,
             cache_mib: 256,
             from: None,
+            profile: false,
+            algorithm: None,
         };
-        let result = train(request, &mut Silent, &AtomicBool::new(false)).unwrap();
+        let result = train(request, &mut Unobserved, &StopSignal::default()).unwrap();
         let pilot = Pilot::load(&result.model).unwrap();
         let options = DriveOptions { runs: 4, ..Default::default() };
-        let on_track = test_on_track(&pilot, &Track::load("lake").unwrap(), &options, None, &|_| true).unwrap();
+        let on_track = test_on_track(&pilot, &Track::load("lake").unwrap(), &options, None, &mut Unobserved).unwrap();
         (result, on_track)
     })
 }
@@ -52,7 +46,7 @@ fn what_is_learned_from_the_expert_drives_and_does_so_alike_for_any_number_of_th
     let (result, lake) = learn(folder.path(), 1);
     let options = DriveOptions { runs: 4, ..Default::default() };
     let new_zero = || -> steersman::Result<Box<dyn Driver>> { Ok(Box::new(Zero)) };
-    let zero = drive(&Track::load("lake").unwrap(), new_zero, &options, &|_| true).unwrap().summary;
+    let zero = drive(&Track::load("lake").unwrap(), new_zero, &options, &mut Unobserved).unwrap().summary;
     eprintln!(
         "offline {:.2} deg; autonomy {:.1} % (zero {:.1} %), way {:.0} m (zero {:.0} m)",
         lake.offline_mae_deg,
@@ -71,24 +65,6 @@ fn what_is_learned_from_the_expert_drives_and_does_so_alike_for_any_number_of_th
     assert_eq!(same_lake.drive.cte_rms_m, lake.drive.cte_rms_m);
 }
 
-/// Sets a flag at the end of the first epoch.
-struct StopsAfterAnEpoch<'a>(&'a AtomicBool);
-
-impl Observer for StopsAfterAnEpoch<'_> {
-    fn notice(&mut self, _: &str) {}
-    fn progress(&mut self, _: u32, _: usize, _: usize, _: f64) {}
-    fn epoch(&mut self, _: &EpochRecord, _: u32) {
-        self.0.store(true, Ordering::Relaxed);
-    }
-}
-
-impl Stages for Silent {
-    fn begin(&self, _: &str) -> Box<dyn Fn(f64) + Sync> {
-        Box::new(|_| {})
-    }
-    fn notice(&self, _: &str) {}
-}
-
 fn small_scope(folder: &Path) -> Scope {
     let take = |recovery, seed| Take { track: "lake".into(), laps: 0.05, reverse: false, recovery, seed };
     Scope {
@@ -105,12 +81,18 @@ fn lenet(epochs: u32) -> Recipe {
 #[test]
 fn a_job_that_was_stopped_goes_on_through_dagger_to_the_drives() {
     let folder = tempfile::tempdir().unwrap();
-    let never = AtomicBool::new(false);
+    let never = StopSignal::default();
     let note = JobNote { runs: 1, dagger_rounds: 1, round: 0 };
-    let request =
-        |name: &str| JobRequest { recipe: lenet(2), out: folder.path().join(name), seed: 5, cache_mib: 64, from: None };
-    let (mut watcher, scope) = (Silent, small_scope(folder.path()));
-    let mut whole = Job::new(scope.clone(), note.clone(), &mut watcher, &Silent, &never);
+    let request = |name: &str| JobRequest {
+        recipe: lenet(2),
+        out: folder.path().join(name),
+        seed: 5,
+        cache_mib: 64,
+        from: None,
+        algorithm: None,
+    };
+    let (mut watcher, scope) = (Unobserved, small_scope(folder.path()));
+    let mut whole = Job::new(scope.clone(), note.clone(), &mut watcher, &never);
     let expected = whole.begin(request("whole")).unwrap();
     assert_eq!(whole.folder().unwrap(), folder.path().join("whole-dagger-1"));
     assert_eq!((expected.drives.len(), expected.drives[0].drive.track.as_str()), (1, "lake"));
@@ -123,21 +105,26 @@ fn a_job_that_was_stopped_goes_on_through_dagger_to_the_drives() {
     let last_note = JobNote::read(&folder.path().join("whole-dagger-1")).unwrap();
     assert_eq!(last_note, Some(JobNote { round: 1, ..note.clone() }));
 
-    let stop = AtomicBool::new(false);
-    let mut stopper = StopsAfterAnEpoch(&stop);
-    let mut stopped = Job::new(scope.clone(), note.clone(), &mut stopper, &Silent, &stop);
+    let stop = StopSignal::default();
+    let mut stopper = |event| {
+        if let JobEvent::Training(TrainingEvent::Epoch { .. }) = event {
+            stop.request();
+        }
+        Ok(())
+    };
+    let mut stopped = Job::new(scope.clone(), note.clone(), &mut stopper, &stop);
     assert!(matches!(stopped.begin(request("stopped")), Err(Error::Interrupted)));
     let path = stopped.folder().unwrap().to_path_buf();
     assert_eq!(path, folder.path().join("stopped"));
     let note = JobNote::read(&path).unwrap().unwrap();
-    let mut watcher = Silent;
-    let result = Job::new(scope.clone(), note.clone(), &mut watcher, &Silent, &never).go_on(&path).unwrap();
+    let mut watcher = Unobserved;
+    let result = Job::new(scope.clone(), note.clone(), &mut watcher, &never).go_on(&path).unwrap();
     assert_eq!(result.training.weights_hash, expected.training.weights_hash);
     assert_eq!(result.drives[0].drive.cte_rms_m, expected.drives[0].drive.cte_rms_m);
 
     // What is there is not overwritten, and that is said before anything is done.
-    let mut watcher = Silent;
-    let again = Job::new(scope, note, &mut watcher, &Silent, &never).begin(request("stopped"));
+    let mut watcher = Unobserved;
+    let again = Job::new(scope, note, &mut watcher, &never).begin(request("stopped"));
     assert!(again.unwrap_err().to_string().contains("stopped is not empty"));
 }
 
@@ -145,8 +132,8 @@ fn a_job_that_was_stopped_goes_on_through_dagger_to_the_drives() {
 fn the_experiments_train_and_drive_every_variant() {
     let folder = tempfile::tempdir().unwrap();
     let scope = small_scope(folder.path());
-    let recordings = recordings(&scope.recordings, &scope.takes, &|_| true).unwrap().0;
-    let go = |subject, stop: &AtomicBool| {
+    let recordings = recordings(&scope.recordings, &scope.takes, &mut Unobserved).unwrap().0;
+    let go = |subject, stop: &StopSignal| {
         let plan = Plan {
             subject,
             recipe: lenet(1),
@@ -157,13 +144,13 @@ fn the_experiments_train_and_drive_every_variant() {
             cache_mib: 64,
         };
         let mut told = 0;
-        let trials = experiment::run(&plan, &mut Silent, &Silent, stop, &mut |_| {
-            told += 1;
+        let mut observer = |event| {
+            told += usize::from(matches!(event, ExperimentEvent::Row(_)));
             Ok(())
-        });
-        (trials, told)
+        };
+        (experiment::run(&plan, &mut observer, stop), told)
     };
-    let never = AtomicBool::new(false);
+    let never = StopSignal::default();
     let (trials, told) = go(Subject::Split, &never);
     let trials = trials.unwrap();
     let variants: Vec<_> = trials.iter().map(|t| (t.variant.as_str(), t.seed)).collect();
@@ -178,5 +165,6 @@ fn the_experiments_train_and_drive_every_variant() {
     let text = std::fs::read_to_string(csv).unwrap();
     assert!(text.starts_with("variant,seed,leak_percent,val_center_mse,") && text.lines().count() == 7, "{text}");
 
-    assert!(matches!(go(Subject::Colour, &AtomicBool::new(true)).0, Err(Error::Interrupted)));
+    never.request();
+    assert!(matches!(go(Subject::Colour, &never).0, Err(Error::Interrupted)));
 }

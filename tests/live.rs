@@ -12,7 +12,7 @@ use common::page::{Page, serve};
 use common::served::{Served, random_model};
 use serde_json::{Value, json};
 use steersman::dataset;
-use steersman::dataset::decode::{RgbImage, decode_rgb};
+use steersman::picture::{RgbImage, decode::decode_rgb};
 
 /// Starts driving by hand in `folder`, recording into `rec`.
 fn by_hand(folder: &Path, args: &[&str]) -> Served {
@@ -239,26 +239,28 @@ fn a_drive_is_watched_in_real_time_by_several_and_ends_with_ctrl_c() {
     let last = loop {
         let frame = page.next().unwrap();
         frames += 1;
-        if frame.state["way"] != first.state["way"] || frame.number("time_s") > first.number("time_s") + 2.0 {
+        if frame.state["trail_id"] != first.state["trail_id"] || frame.number("time_s") > first.number("time_s") + 2.0 {
             break frame;
         }
     };
     let (driven_s, waited_s) = (last.number("time_s") - first.number("time_s"), began.elapsed().as_secs_f64());
     assert!(frames > 5 && driven_s < waited_s + 0.4, "{frames} frames, {driven_s} s driven in {waited_s} s");
     let skipped = slow.next().unwrap();
-    assert!(skipped.number("way") > last.number("way") || skipped.number("time_s") >= last.number("time_s") - 0.2);
+    assert!(
+        skipped.number("trail_id") > last.number("trail_id") || skipped.number("time_s") >= last.number("time_s") - 0.2
+    );
 
     // Commands of a watching page mean nothing.
     page.ask(&json!({ "type": "finish" }));
     page.press(1, 1);
     // A random network leaves the road; then the same run is driven with help, on a clean map.
     let began = Instant::now();
-    while page.next().unwrap().state["way"] == first.state["way"] {
+    while page.next().unwrap().state["trail_id"] == first.state["trail_id"] {
         assert!(began.elapsed() < common::double::SILENCE);
     }
     std::thread::sleep(Duration::from_secs(1));
     let late = Page::open(served.port);
-    assert!(!late.hello["trail"].as_array().unwrap().is_empty(), "who comes late sees the way so far");
+    assert!(!late.hello["trail"].as_array().unwrap().is_empty(), "who comes late sees the trail so far");
     drop((late, slow));
     served.interrupt();
     let words = loop {

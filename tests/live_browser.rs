@@ -125,8 +125,8 @@ fn a_drive_is_watched_with_its_saliency() {
     for size in [[1600, 900], [1024, 768]] {
         assert_fits(&mut browser, size);
     }
-    let time = browser.value("state.time_s + 100 * state.way").as_f64().unwrap();
-    browser.wait_for(&format!("state.time_s + 100 * state.way > {time} + 0.5"));
+    let time = browser.value("state.time_s + 100 * state.trail_id").as_f64().unwrap();
+    browser.wait_for(&format!("state.time_s + 100 * state.trail_id > {time} + 0.5"));
     assert!(browser.complaints.is_empty(), "{:?}", browser.complaints);
     // The browser stays; the page says that the drive is over.
     served.interrupt();

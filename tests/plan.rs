@@ -140,26 +140,41 @@ fn a_prediction_does_not_depend_on_the_other_images() {
     }
 }
 
+/// The share of the labels' variance that is left after learning, as the mean of the last hundred steps.
+fn unexplained_variance(setup: &Setup, network: &Network, seed: u64) -> f64 {
+    let mut plan = TrainingPlan::new(network, 8);
+    let mut optimizer = Optimizer::new(setup.recipe.optimizer, None, network);
+    let mut parameters = network.initialize(seed);
+    let losses: Vec<f64> = (0..1000)
+        .map(|_| {
+            let input = StepInput { x: &setup.x, labels: &setup.labels, seed, step: optimizer.updates };
+            let loss = plan.step(network, &mut parameters, &Loss::default(), input);
+            let norm = plan.gradient_norm();
+            optimizer.step(1e-3, &mut parameters.values, plan.gradient_mut(), norm);
+            loss
+        })
+        .collect();
+    let mean = setup.labels.iter().map(|label| f64::from(*label)).sum::<f64>() / 8.0;
+    let variance = setup.labels.iter().map(|label| (f64::from(*label) - mean).powi(2)).sum::<f64>() / 8.0;
+    losses[900..].iter().sum::<f64>() / 100.0 / variance
+}
+
+/// The best prediction that looks at no image is the mean of the labels: it leaves all of their variance. A network that
+/// leaves less than a tenth tells the images apart. Every instruction set leaves less than a thousandth, so rounding cannot
+/// decide; three seeds leave nothing to a lucky draw.
 #[test]
 fn a_network_can_learn_eight_images_by_heart() {
     let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
     for (recipe, size) in NETWORKS {
         let setup = Setup::new(recipe, size, 8);
         // Dropout is there to prevent just this.
-        let layers: Vec<_> = setup
-            .recipe
-            .layers
-            .iter()
-            .filter(|layer| !matches!(layer, steersman::engine::network::LayerSpec::Dropout { .. }))
-            .cloned()
-            .collect();
+        let layers: Vec<_> =
+            setup.recipe.layers.iter().filter(|layer| !matches!(layer, LayerSpec::Dropout { .. })).cloned().collect();
         let network = Network::new(setup.network.input(), &layers, Isa::best()).unwrap();
-        let setup = Setup { network, ..setup };
-        let (mut plan, mut optimizer) = (TrainingPlan::new(&setup.network, 8), setup.optimizer());
-        let mut parameters = setup.network.initialize(1);
-        let first = setup.step(&mut plan, &mut optimizer, &mut parameters);
-        let last = (0..1000).map(|_| setup.step(&mut plan, &mut optimizer, &mut parameters)).last().unwrap();
-        assert!(last < first / 30.0, "{recipe}: from {first} to {last}");
+        for seed in 1..=3 {
+            let left = unexplained_variance(&setup, &network, seed);
+            assert!(left < 0.1, "{recipe}, seed {seed}: {left} of the variance of the labels is left");
+        }
     }
 }
 

@@ -5,7 +5,8 @@
 use std::fs;
 use std::path::Path;
 
-use steersman::dataset::decode::{RgbImage, decode_rgb};
+use steersman::observer::Unobserved;
+use steersman::picture::{RgbImage, decode::decode_rgb};
 use steersman::simulator::{RecordOptions, Track, record};
 
 /// Every ninth frame of a 10 Hz drive: neighbours stay within the second that makes them one session.
@@ -19,7 +20,7 @@ fn draw(folder: &Path) {
     let scratch = tempfile::tempdir().unwrap();
     let drive = scratch.path().join("drive");
     let options = RecordOptions { laps: 0.18, seed: 1, ..RecordOptions::default() };
-    record(&Track::load("lake").unwrap(), &options, &drive, &|_| true).unwrap();
+    record(&Track::load("lake").unwrap(), &options, &drive, &mut Unobserved).unwrap();
 
     fs::create_dir_all(folder.join("IMG")).unwrap();
     let log = fs::read_to_string(drive.join("driving_log.csv")).unwrap();

@@ -11,23 +11,15 @@ use std::time::Duration;
 use common::command::{error, json, steersman};
 use common::served::{Client, SIMULATOR, Served, command, random_model, sample_jpeg, telemetry};
 use serde_json::Value;
+use steersman::observer::Unobserved;
 use steersman::pilot::Pilot;
-use steersman::serve::client::{ClientOptions, ClientReport, Numbers, Observer, Pace, drive};
-use steersman::serve::protocol::DecimalMark;
-use steersman::simulator::trial::run::run;
-use steersman::simulator::{RunOptions, Speed, Track};
+use steersman::simulator::run_trial;
+use steersman::simulator::{Speed, Track, TrialOptions};
+use steersman::simulator_client::{ClientOptions, ClientReport, TimeMode, drive};
+use steersman::udacity::{DecimalMark, NumberStyle};
 
 /// Long enough for an answer that must not come. (Where the machine stands still, a wrong answer could be missed, not invented.)
 const QUIET: Duration = Duration::from_millis(400);
-
-struct Silent;
-
-impl Observer for Silent {
-    fn notice(&mut self, _: &str) {}
-    fn progress(&mut self, _: f64) -> bool {
-        true
-    }
-}
 
 /// A folder with `model`, a small network with random weights.
 fn folder_with_model() -> tempfile::TempDir {
@@ -45,14 +37,14 @@ fn lockstep(served: &Served) -> ClientOptions {
     ClientOptions {
         url: format!("ws://127.0.0.1:{}", served.port).parse().unwrap(),
         seed: 2,
-        pace: Pace::Lockstep,
+        time_mode: TimeMode::Lockstep,
         patience_s: 120.0,
         ..ClientOptions::default()
     }
 }
 
 fn drive_lake(options: &ClientOptions) -> ClientReport {
-    drive(&Track::load("lake").unwrap(), options, &mut Silent).unwrap()
+    drive(&Track::load("lake").unwrap(), options, &mut Unobserved).unwrap()
 }
 
 fn count(value: &Value, name: &str) -> u64 {
@@ -64,11 +56,11 @@ fn in_lockstep_the_way_through_the_server_is_the_way_of_drive_bit_for_bit_in_eve
     let folder = folder_with_model();
     let served = serve(&folder, &[]);
     let mut pilot = Pilot::load(&folder.path().join("model")).unwrap();
-    let options = RunOptions { laps: 1, speed: Speed::Fixed(20.0), latency_ms: 0.0, noise: 0.0, assisted: false };
-    let expected = run(&Track::load("lake").unwrap(), &mut pilot, &options, 2).unwrap();
+    let options = TrialOptions { laps: 1, speed: Speed::Fixed(20.0), latency_ms: 0.0, noise: 0.0, assisted: false };
+    let expected = run_trial(&Track::load("lake").unwrap(), &mut pilot, &options, 2).unwrap();
     assert!(expected.moments.len() > 30, "{} frames are too few to prove something", expected.moments.len());
     for mark in [DecimalMark::DOT, DecimalMark::COMMA] {
-        let report = drive_lake(&ClientOptions { numbers: Numbers::Strings(mark), ..lockstep(&served) });
+        let report = drive_lake(&ClientOptions { numbers: NumberStyle::Strings(mark), ..lockstep(&served) });
         assert_eq!(report.run, expected, "{mark:?}");
         assert_eq!((report.tokens_lost, report.connections), (0, 1));
     }
@@ -111,7 +103,7 @@ fn a_person_takes_the_wheel_and_gives_it_back() {
 fn a_simulator_of_the_second_term_gets_numbers() {
     let folder = folder_with_model();
     let served = serve(&folder, &[]);
-    let report = drive_lake(&ClientOptions { numbers: Numbers::Json, frames: Some(20), ..lockstep(&served) });
+    let report = drive_lake(&ClientOptions { numbers: NumberStyle::Json, frames: Some(20), ..lockstep(&served) });
     assert_eq!((report.commands, report.tokens_lost), (20, 0));
     served.stop();
 }
@@ -131,8 +123,8 @@ fn after_a_change_of_scene_the_drive_begins_anew() {
 fn in_real_time_it_drives_as_well_and_reports_latencies() {
     let folder = folder_with_model();
     let served = serve(&folder, &[]);
-    let pace = Pace::RealTime { fps: 30.0 };
-    let report = drive_lake(&ClientOptions { pace, frames: Some(40), ..lockstep(&served) });
+    let time_mode = TimeMode::RealTime { fps: 30.0 };
+    let report = drive_lake(&ClientOptions { time_mode, frames: Some(40), ..lockstep(&served) });
     assert_eq!((report.commands, report.round_trips_ms.len(), report.tokens_lost), (40, 40, 0));
     let (summary, _) = served.stop();
     let ms = |name: &str| summary[name].as_f64().unwrap();

@@ -9,35 +9,27 @@ use common::double::{Peer, start};
 use data_encoding::BASE64;
 use serde_json::Value;
 use steersman::Error;
-use steersman::dataset::decode::{RgbImage, decode_rgb};
-use steersman::serve::client::{ClientOptions, ClientReport, Numbers, Observer, Pace, drive};
-use steersman::serve::protocol::DecimalMark;
-use steersman::simulator::car::speed::SpeedController;
-use steersman::simulator::trial::run::run;
-use steersman::simulator::{DriveState, Driver, RgbFrame, RunOptions, Speed, Track};
-
-struct Silent;
-
-impl Observer for Silent {
-    fn notice(&mut self, _: &str) {}
-    fn progress(&mut self, _: f64) -> bool {
-        true
-    }
-}
+use steersman::observer::Unobserved;
+use steersman::picture::{RgbImage, decode::decode_rgb};
+use steersman::simulator::SpeedController;
+use steersman::simulator::run_trial;
+use steersman::simulator::{DriveState, Driver, RgbFrame, Speed, Track, TrialOptions};
+use steersman::simulator_client::{ClientOptions, ClientReport, TimeMode, drive};
+use steersman::udacity::{DecimalMark, NumberStyle};
 
 /// In lockstep with a server on `port`, for `frames` replies.
 fn lockstep(port: u16, frames: u64) -> ClientOptions {
     ClientOptions {
         url: format!("ws://127.0.0.1:{port}").parse().unwrap(),
         seed: 3,
-        pace: Pace::Lockstep,
+        time_mode: TimeMode::Lockstep,
         frames: Some(frames),
         ..ClientOptions::default()
     }
 }
 
 fn drive_lake(options: &ClientOptions) -> ClientReport {
-    drive(&Track::load("lake").unwrap(), options, &mut Silent).unwrap()
+    drive(&Track::load("lake").unwrap(), options, &mut Unobserved).unwrap()
 }
 
 /// The fields of a telemetry.
@@ -92,8 +84,8 @@ fn in_lockstep_a_drive_over_the_wire_is_the_drive_in_this_process_bit_for_bit() 
     });
     let options = ClientOptions { frames: None, ..lockstep(port, 0) };
     let report = drive_lake(&options);
-    let here = RunOptions { laps: 1, speed: Speed::Fixed(20.0), latency_ms: 0.0, noise: 0.0, assisted: false };
-    let expected = run(&Track::load("lake").unwrap(), &mut AwayFromLight, &here, 3).unwrap();
+    let here = TrialOptions { laps: 1, speed: Speed::Fixed(20.0), latency_ms: 0.0, noise: 0.0, assisted: false };
+    let expected = run_trial(&Track::load("lake").unwrap(), &mut AwayFromLight, &here, 3).unwrap();
     assert!(expected.moments.len() > 40, "{} frames are too few to prove something", expected.moments.len());
     assert_eq!(report.run, expected);
     assert_eq!(report.telemetries as usize, expected.moments.len());
@@ -310,7 +302,7 @@ fn a_machine_with_decimal_comma_writes_commas_and_misreads_dots() {
         while peer.next().is_some_and(|text| text != "41") {}
         (first, second)
     });
-    let comma = Numbers::Strings(DecimalMark::COMMA);
+    let comma = NumberStyle::Strings(DecimalMark::COMMA);
     let report = drive_lake(&ClientOptions { numbers: comma, ..lockstep(port, 2) });
     let (first, second) = server.join().unwrap();
     assert!(first.contains(r#""speed":"20,0000""#) && second.contains(r#""steering_angle":"3,1250""#), "{second:.120}");
@@ -353,7 +345,7 @@ fn in_real_time_the_clock_goes_on_without_replies_and_the_car_keeps_its_last_com
         }
         telemetries
     });
-    let options = ClientOptions { pace: Pace::RealTime { fps: 50.0 }, frames: None, ..lockstep(port, 0) };
+    let options = ClientOptions { time_mode: TimeMode::RealTime { fps: 50.0 }, frames: None, ..lockstep(port, 0) };
     let report = drive_lake(&options);
     assert_eq!(server.join().unwrap(), 1, "one for the command, then the token is gone");
     assert!(report.run.failure.is_some(), "{:?}", report.run.failure);
@@ -370,10 +362,10 @@ fn no_server_and_a_server_without_a_word_are_errors_with_a_remedy() {
     server.join().unwrap();
     let impatient = |port| ClientOptions { patience_s: 0.3, ..lockstep(port, 1) };
     let message = |result: steersman::Result<ClientReport>| match result {
-        Err(Error::Usage(message)) => message,
+        Err(Error::Connection(message)) => message,
         other => panic!("{other:?}"),
     };
-    let nobody = message(drive(&track, &impatient(port), &mut Silent));
+    let nobody = message(drive(&track, &impatient(port), &mut Unobserved));
     assert!(nobody.contains(&format!("127.0.0.1:{port}")) && nobody.contains("steersman serve"), "{nobody}");
 
     let (port, server) = start(|listener| {
@@ -381,13 +373,13 @@ fn no_server_and_a_server_without_a_word_are_errors_with_a_remedy() {
         while peer.next().is_some_and(|text| text != "41") {}
         peer.stream().shutdown(Shutdown::Both)
     });
-    let silent = message(drive(&track, &impatient(port), &mut Silent));
+    let silent = message(drive(&track, &impatient(port), &mut Unobserved));
     assert!(silent.contains("no reply to telemetry"), "{silent}");
     let _ = server.join().unwrap();
 
     // Closes every connection at once; its thread ends with the test.
     let (port, _) = start(|listener| listener.incoming().for_each(drop));
-    let closing = message(drive(&track, &impatient(port), &mut Silent));
+    let closing = message(drive(&track, &impatient(port), &mut Unobserved));
     assert!(closing.contains("steersman serve"), "{closing}");
 }
 
@@ -397,11 +389,11 @@ fn impossible_options_are_refused_before_anything_is_connected() {
     for options in [
         ClientOptions { laps: 0, ..ClientOptions::default() },
         ClientOptions { start_mph: 99.0, ..ClientOptions::default() },
-        ClientOptions { pace: Pace::RealTime { fps: 0.0 }, ..ClientOptions::default() },
+        ClientOptions { time_mode: TimeMode::RealTime { fps: 0.0 }, ..ClientOptions::default() },
         ClientOptions { manual_s: Some((5.0, 2.0)), ..ClientOptions::default() },
         ClientOptions { scene_change_s: Some(f64::NAN), ..ClientOptions::default() },
         ClientOptions { patience_s: 0.0, ..ClientOptions::default() },
     ] {
-        assert!(matches!(drive(&track, &options, &mut Silent), Err(Error::Usage(_))), "{options:?}");
+        assert!(matches!(drive(&track, &options, &mut Unobserved), Err(Error::Usage(_))), "{options:?}");
     }
 }

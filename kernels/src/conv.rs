@@ -1,92 +1,113 @@
 //! Convolution and its gradients.
 //!
-//! | pass | algorithm |
-//! |---|---|
-//! | all three, where it gains | the same sums at points of the rows: minimal filtering takes half to two thirds of the products (`winograd`, which says for which shapes) |
-//! | forward | a sum over taps with vectors along the output rows (`direct`), of the image itself when the stride is 1 and nothing is padded, else of a copy that is padded and split into phases (`prepare`) |
-//! | input gradient | for each phase of the input the same sum over the zero-padded output gradient, with the kernel turned round (`input_gradient`); where that would mostly multiply zeros, a matrix product and [`crate::im2col::col2im`] |
-//! | weight gradient | vectors along the output rows, summed over lanes at the end (`weight_gradient`) |
-//! | both gradients, behind 4x4 pooling | one position at a time (`sparse`) |
+//! A convolution has three passes. For each of them [`ConvAlgorithm::Auto`] takes the first algorithm of this table that
+//! its condition admits; [`ConvAlgorithm::Im2col`] takes the last one for all three.
 //!
-//! Within a pass the sizes of tiles and blocks follow from the shape and the instruction set: see `direct`.
+//! | algorithm | passes | condition | how |
+//! |---|---|---|---|
+//! | `patch_gradient` | input gradient | maps of so few rows that most taps would multiply zeros (3x18) | a matrix product gives the gradient of each patch; overlapping patches are added up |
+//! | `winograd` | all | kernels of 3 rows, or 5 with a stride of 2, on maps large enough to gain (`winograd::choice`) | Winograd minimal filtering along the rows: half to two thirds of the products |
+//! | `direct` | forward, weight gradient | any | a sum over taps, with vectors along the output rows |
+//! | `input_gradient` | input gradient | any | the same sum over the zero-padded output gradient, with the kernel turned by 180 degrees |
+//! | `sparse` | both gradients | behind 4x4 max pooling; the caller asks for it | one multiply-add at a time at the few positions with a gradient |
+//! | `im2col` | all | when asked for | the textbook: the image as a matrix of patches, and one matrix product a pass |
+//!
+//! To read how a convolution works, begin with `im2col`: it is the shortest, and the others compute the same.
+//!
+//! Within a pass the sizes of tiles and blocks follow from the shape and the instruction set: see `tap_sum`.
 
 mod direct;
-mod grid;
+mod im2col;
 mod input_gradient;
-mod prepare;
-mod shape;
+mod layout;
+mod patch_gradient;
+mod phase;
+mod span;
 mod sparse;
+mod tap_sum;
 mod weight_gradient;
 mod winograd;
 
 use crate::Isa;
-use crate::simd::MOST_LANES;
-use direct::{Band, TapSum};
-use input_gradient::InputGradient;
-use prepare::Layout;
-pub use shape::ConvShape;
+use crate::backend::Backend;
+pub use crate::conv_algorithm::ConvAlgorithm;
+pub use crate::conv_shape::ConvShape;
+use direct::Direct;
+use im2col::Im2col;
+use patch_gradient::PatchGradient;
 
-/// Elements of copied images that the forward pass works on at a time: 256 KiB leaves room in the second-level cache.
-const FORWARD_COPIES: usize = 1 << 16;
-/// The same for the weight gradient: 2 MiB. It sums over lanes once a group, so groups should be large.
-const GRADIENT_COPIES: usize = 1 << 19;
-
-/// How many images of `image` elements are copied at a time, within a budget of elements.
-fn group_of(image: usize, budget: usize) -> usize {
-    (budget / image.max(1)).clamp(1, 8)
-}
-
-/// A convolution of one shape on one instruction set, with the tables of each pass worked out.
+/// A convolution of one shape on one backend. It holds the tables of each pass.
 #[derive(Clone, Debug)]
 pub struct Conv {
     shape: ConvShape,
-    isa: Isa,
-    layout: Layout,
-    sum: TapSum,
+    backend: Backend,
+    forward: Forward,
     input_gradient: InputGradient,
-    /// The passes that gain by minimal filtering, in place of those above.
-    fast_forward: Option<winograd::Forward>,
-    fast_input_gradient: Option<winograd::InputGradient>,
-    fast_weight_gradient: Option<winograd::WeightGradient>,
+    weight_gradient: WeightGradient,
+}
+
+/// The algorithm of the forward pass.
+#[derive(Clone, Debug)]
+enum Forward {
+    Direct(Direct),
+    Winograd(winograd::Forward),
+    Im2col(Im2col),
+}
+
+/// The algorithm of the input gradient.
+#[derive(Clone, Debug)]
+enum InputGradient {
+    Direct(input_gradient::InputGradient),
+    Winograd(winograd::InputGradient),
+    Patches(PatchGradient),
+    Im2col(Im2col),
+}
+
+/// The algorithm of the weight gradient.
+#[derive(Clone, Debug)]
+enum WeightGradient {
+    Direct(Direct),
+    Winograd(winograd::WeightGradient),
+    Im2col(Im2col),
 }
 
 impl Conv {
-    /// Plans the convolution.
+    /// Chooses the algorithms of `shape` on `backend` and computes their tables.
     ///
     /// # Panics
     /// If a size other than the padding is 0.
-    pub fn new(shape: ConvShape, isa: Isa) -> Conv {
+    pub fn new(shape: ConvShape, backend: impl Into<Backend>) -> Conv {
         let ConvShape { c, h, w, oc, kh, kw, stride_h, stride_w, .. } = shape;
         assert!(
             [c, h, w, oc, kh, kw, stride_h, stride_w].iter().all(|&size| size > 0),
             "convolution: every size but the padding must be at least 1 in {shape:?}"
         );
-        let layout = Layout::new(shape);
-        let spans = grid::spans(shape.out_h(), shape.out_w(), layout.pitch, isa.lanes());
-        let bands = if spans.is_empty() { vec![] } else { vec![Band { spans: 0..spans.len(), taps: 0..shape.taps() }] };
-        let sum = TapSum {
-            taps: layout.taps(),
-            weights: (0..shape.taps()).collect(),
-            weight_stride: shape.taps(),
-            spans,
-            bands,
-            origin: 0,
-            in_image: layout.image(),
-            channels: shape.oc,
-            plane: shape.out_pixels(),
+        let backend = backend.into();
+        let isa = backend.isa;
+        let (forward, input_gradient, weight_gradient) = match backend.conv {
+            ConvAlgorithm::Im2col => {
+                let im2col = || Im2col::new(shape);
+                (Forward::Im2col(im2col()), InputGradient::Im2col(im2col()), WeightGradient::Im2col(im2col()))
+            }
+            ConvAlgorithm::Auto => {
+                let by_taps = input_gradient::InputGradient::new(shape, isa);
+                let input_gradient = if by_taps.mostly_multiplies_zeros() {
+                    InputGradient::Patches(PatchGradient::new(shape, isa))
+                } else if let Some(winograd) = winograd::InputGradient::new(shape, isa) {
+                    InputGradient::Winograd(winograd)
+                } else {
+                    InputGradient::Direct(by_taps)
+                };
+                (
+                    winograd::Forward::new(shape, isa)
+                        .map_or_else(|| Forward::Direct(Direct::new(shape, isa)), Forward::Winograd),
+                    input_gradient,
+                    winograd::WeightGradient::new(shape, isa)
+                        .map_or_else(|| WeightGradient::Direct(Direct::new(shape, isa)), WeightGradient::Winograd),
+                )
+            }
         };
-        let input_gradient = InputGradient::new(shape, isa);
-        let fast_input_gradient = if input_gradient.by_product() { None } else { winograd::InputGradient::new(shape) };
-        Conv {
-            shape,
-            isa,
-            layout,
-            sum,
-            input_gradient,
-            fast_forward: winograd::Forward::new(shape),
-            fast_input_gradient,
-            fast_weight_gradient: winograd::WeightGradient::new(shape),
-        }
+        Conv { shape, backend, forward, input_gradient, weight_gradient }
     }
 
     /// The sizes.
@@ -96,31 +117,33 @@ impl Conv {
 
     /// The instruction set it runs on.
     pub fn isa(&self) -> Isa {
-        self.isa
+        self.backend.isa
     }
 
-    /// Elements of `scratch` that are enough for every pass, whatever the number of images.
+    /// How it was told to compute its passes.
+    pub fn algorithm(&self) -> ConvAlgorithm {
+        self.backend.conv
+    }
+
+    /// Length of the scratch buffer that is enough for every pass, whatever the number of images.
     pub fn scratch_len(&self) -> usize {
-        let forward = self.forward_scratch_len() + self.packed_len();
-        let input_gradient = match &self.fast_input_gradient {
-            Some(fast) => fast.scratch_len(),
-            None => self.input_gradient.scratch_len(),
+        let forward = match &self.forward {
+            Forward::Direct(direct) => direct.forward_scratch_len(),
+            Forward::Winograd(winograd) => winograd.scratch_len(),
+            Forward::Im2col(im2col) => im2col.scratch_len(),
         };
-        let weight_gradient = match &self.fast_weight_gradient {
-            Some(fast) => fast.scratch_len(),
-            None => self.copy_len(GRADIENT_COPIES) + weight_gradient::scratch_len(self.shape.taps()),
+        let input_gradient = match &self.input_gradient {
+            InputGradient::Direct(direct) => direct.scratch_len(),
+            InputGradient::Winograd(winograd) => winograd.scratch_len(),
+            InputGradient::Patches(patches) => patches.scratch_len(),
+            InputGradient::Im2col(im2col) => im2col.scratch_len(),
         };
-        forward.max(weight_gradient).max(input_gradient + self.packed_gradient_len())
-    }
-
-    fn forward_scratch_len(&self) -> usize {
-        self.fast_forward.as_ref().map_or_else(|| self.copy_len(FORWARD_COPIES), winograd::Forward::scratch_len)
-    }
-
-    /// Elements of the copied images of a group.
-    fn copy_len(&self, budget: usize) -> usize {
-        let image = self.layout.image();
-        if self.layout.copies { group_of(image, budget) * image + MOST_LANES } else { 0 }
+        let weight_gradient = match &self.weight_gradient {
+            WeightGradient::Direct(direct) => direct.backward_weight_scratch_len(),
+            WeightGradient::Winograd(winograd) => winograd.scratch_len(),
+            WeightGradient::Im2col(im2col) => im2col.scratch_len(),
+        };
+        (forward + self.packed_len()).max(input_gradient + self.packed_gradient_len()).max(weight_gradient)
     }
 
     fn check_scratch(&self, pass: &str, len: usize) {
@@ -134,7 +157,7 @@ impl Conv {
     /// an image does not depend on the others.
     ///
     /// # Panics
-    /// If a slice has another length, or `scratch` less than [`Conv::scratch_len`].
+    /// If a slice has another length, or `scratch` is shorter than [`Conv::scratch_len`].
     pub fn forward(&self, n: usize, x: &[f32], weight: &[f32], bias: &[f32], y: &mut [f32], scratch: &mut [f32]) {
         self.check_scratch("conv forward", scratch.len());
         let (packed, scratch) = scratch.split_at_mut(self.packed_len());
@@ -142,12 +165,16 @@ impl Conv {
         self.run_packed(n, x, packed, y, scratch);
     }
 
-    /// Elements that the weights and bias of [`Conv::pack`] take.
+    /// Length of the packed weights and bias of the forward pass.
     pub fn packed_len(&self) -> usize {
-        self.fast_forward.as_ref().map_or_else(|| self.sum.packed_len(), winograd::Forward::packed_len)
+        match &self.forward {
+            Forward::Direct(direct) => direct.packed_len(),
+            Forward::Winograd(winograd) => winograd.packed_len(),
+            Forward::Im2col(_) => self.shape.oc * (self.shape.taps() + 1),
+        }
     }
 
-    /// Puts weights and bias in the order in which [`Conv::forward_packed`] reads them.
+    /// Packs weights and bias for [`Conv::forward_packed`]: puts them in the order in which it reads them.
     ///
     /// # Panics
     /// If a slice has another length; that of `packed` is [`Conv::packed_len`].
@@ -156,10 +183,18 @@ impl Conv {
         assert_eq!(weight.len(), shape.oc * shape.taps(), "conv pack: length of the weights of {shape:?}");
         assert_eq!(bias.len(), shape.oc, "conv pack: length of the bias of {shape:?}");
         assert_eq!(packed.len(), self.packed_len(), "conv pack: length of the packed weights of {shape:?}");
-        pack(self.isa, self, weight, bias, packed);
+        match &self.forward {
+            Forward::Direct(direct) => direct.pack(weight, bias, packed),
+            Forward::Winograd(winograd) => winograd.pack(weight, bias, packed),
+            Forward::Im2col(_) => {
+                let (packed_weight, packed_bias) = packed.split_at_mut(weight.len());
+                packed_weight.copy_from_slice(weight);
+                packed_bias.copy_from_slice(bias);
+            }
+        }
     }
 
-    /// As [`Conv::forward`], with weights and bias from [`Conv::pack`].
+    /// As [`Conv::forward`], with packed weights from [`Conv::pack`].
     ///
     /// # Panics
     /// As [`Conv::forward`].
@@ -173,18 +208,27 @@ impl Conv {
         let shape = &self.shape;
         assert_eq!(x.len(), n * shape.x_len(), "conv forward: length of the {n} inputs of {shape:?}");
         assert_eq!(y.len(), n * shape.y_len(), "conv forward: length of the {n} outputs of {shape:?}");
-        if !y.is_empty() {
-            forward(self.isa, self, x, packed, y, scratch);
+        if y.is_empty() {
+            return;
+        }
+        match &self.forward {
+            Forward::Direct(direct) => direct.forward(x, packed, y, scratch),
+            Forward::Winograd(winograd) => winograd.run(x, packed, y, scratch),
+            Forward::Im2col(im2col) => {
+                let (weight, bias) = packed.split_at(shape.oc * shape.taps());
+                im2col.forward(x, weight, bias, y, scratch);
+            }
         }
     }
 
-    /// The gradient with respect to the input of `n` images; `dx` is overwritten.
+    /// The gradient of [`Conv::forward`], `y = conv(x, weight) + bias`, with respect to the input of `n` images; `dx` is
+    /// overwritten.
     ///
     /// # Shapes
     /// As for [`Conv::forward`], `dy` like `y` and `dx` like `x`.
     ///
     /// # Panics
-    /// If a slice has another length, or `scratch` less than [`Conv::scratch_len`].
+    /// If a slice has another length, or `scratch` is shorter than [`Conv::scratch_len`].
     pub fn backward_input(&self, n: usize, dy: &[f32], weight: &[f32], dx: &mut [f32], scratch: &mut [f32]) {
         self.check_scratch("conv backward_input", scratch.len());
         let (packed, scratch) = scratch.split_at_mut(self.packed_gradient_len());
@@ -192,15 +236,16 @@ impl Conv {
         self.run_packed_gradient(n, dy, packed, dx, scratch);
     }
 
-    /// Elements that the weights of [`Conv::pack_gradient`] take.
+    /// Length of the packed weights of the input gradient.
     pub fn packed_gradient_len(&self) -> usize {
-        match &self.fast_input_gradient {
-            Some(fast) => fast.packed_len(),
-            None => self.input_gradient.packed_len(),
+        match &self.input_gradient {
+            InputGradient::Direct(direct) => direct.packed_len(),
+            InputGradient::Winograd(winograd) => winograd.packed_len(),
+            InputGradient::Patches(_) | InputGradient::Im2col(_) => self.shape.oc * self.shape.taps(),
         }
     }
 
-    /// Puts the weights in the order in which [`Conv::backward_input_packed`] reads them.
+    /// Packs weights for [`Conv::backward_input_packed`]: puts them in the order in which it reads them.
     ///
     /// # Panics
     /// If a slice has another length; that of `packed` is [`Conv::packed_gradient_len`].
@@ -212,10 +257,14 @@ impl Conv {
             self.packed_gradient_len(),
             "conv pack_gradient: length of the packed weights of {shape:?}"
         );
-        pack_gradient(self.isa, self, weight, packed);
+        match &self.input_gradient {
+            InputGradient::Direct(direct) => direct.pack(weight, packed),
+            InputGradient::Winograd(winograd) => winograd.pack(weight, packed),
+            InputGradient::Patches(_) | InputGradient::Im2col(_) => packed.copy_from_slice(weight),
+        }
     }
 
-    /// As [`Conv::backward_input`], with weights from [`Conv::pack_gradient`].
+    /// As [`Conv::backward_input`], with packed weights from [`Conv::pack_gradient`].
     ///
     /// # Panics
     /// As [`Conv::backward_input`].
@@ -235,21 +284,24 @@ impl Conv {
         assert_eq!(dx.len(), n * shape.x_len(), "conv backward_input: length of the {n} inputs of {shape:?}");
         assert_eq!(dy.len(), n * shape.y_len(), "conv backward_input: length of the {n} outputs of {shape:?}");
         if dy.is_empty() || dx.is_empty() {
-            dx.fill(0.0);
-        } else if let Some(fast) = &self.fast_input_gradient {
-            fast_input_gradient(self.isa, fast, dy, packed, dx, scratch);
-        } else {
-            input_gradient::run(self.isa, &self.input_gradient, dy, packed, dx, scratch);
+            return dx.fill(0.0);
+        }
+        match &self.input_gradient {
+            InputGradient::Direct(direct) => direct.run(dy, packed, dx, scratch),
+            InputGradient::Winograd(winograd) => winograd.run(dy, packed, dx, scratch),
+            InputGradient::Patches(patches) => patches.run(dy, packed, dx, scratch),
+            InputGradient::Im2col(im2col) => im2col.backward_input(dy, packed, dx, scratch),
         }
     }
 
-    /// The gradients with respect to weight and bias, summed over `n` images and added to `dweight` and `dbias`.
+    /// The gradients of [`Conv::forward`], `y = conv(x, weight) + bias`, with respect to weight and bias, summed over `n` images
+    /// and added to `dweight` and `dbias`.
     ///
     /// # Shapes
-    /// As for [`Conv::forward`], each gradient like what it is the gradient of.
+    /// As for [`Conv::forward`]; each gradient has the shape of its tensor.
     ///
     /// # Panics
-    /// If a slice has another length, or `scratch` less than [`Conv::scratch_len`].
+    /// If a slice has another length, or `scratch` is shorter than [`Conv::scratch_len`].
     pub fn backward_weight(
         &self,
         n: usize,
@@ -265,134 +317,61 @@ impl Conv {
         assert_eq!(dweight.len(), shape.oc * shape.taps(), "conv backward_weight: length of the weights of {shape:?}");
         assert_eq!(dbias.len(), shape.oc, "conv backward_weight: length of the bias of {shape:?}");
         self.check_scratch("conv backward_weight", scratch.len());
-        if !dy.is_empty() {
-            backward_weight(self.isa, self, x, dy, dweight, dbias, scratch);
+        if dy.is_empty() {
+            return;
+        }
+        match &self.weight_gradient {
+            WeightGradient::Direct(direct) => direct.backward_weight(x, dy, dweight, dbias, scratch),
+            WeightGradient::Winograd(winograd) => winograd.run(x, dy, dweight, dbias, scratch),
+            WeightGradient::Im2col(im2col) => im2col.backward_weight(x, dy, dweight, dbias, scratch),
         }
     }
 }
 
-/// Gradients from `count` positions of each output channel, all others being 0.
+/// Gradients from `count` positions of each output channel; the gradient at all others is 0.
 ///
-/// `starts` tells the positions, `[n][oc][count]`: where the window of the output begins in a plane of the input,
-/// `oy * w + ox`. `dy` are the output gradients there.
+/// `argmax` holds the positions, `[n][oc][count]`: where the window of the output begins in a plane of the input, `oy * w + ox`.
+/// Max pooling gives them ([`pool::max_forward_with_argmax`](crate::pool::max_forward_with_argmax)). `dy` holds the output
+/// gradients at these positions.
 impl Conv {
-    /// Whether the shape has these: strides of 1, no padding, 3x3 or 5x5 kernels.
+    /// Whether the shape and the algorithm have sparse gradients: strides of 1, no padding, 3x3 or 5x5 kernels, and
+    /// [`ConvAlgorithm::Auto`].
     pub fn has_sparse_gradients(&self) -> bool {
-        sparse::supports(&self.shape)
+        self.backend.conv == ConvAlgorithm::Auto && sparse::supports(&self.shape)
     }
 
     /// As [`Conv::backward_weight`].
     ///
     /// # Panics
-    /// If a slice has another length, a start lies outside the plane, or the shape has no sparse gradients.
+    /// If a slice has another length, a position lies outside the plane, or the shape has no sparse gradients.
     pub fn sparse_backward_weight(
         &self,
         n: usize,
         x: &[f32],
-        starts: &[u32],
+        argmax: &[u32],
         dy: &[f32],
         dweight: &mut [f32],
         dbias: &mut [f32],
     ) {
-        self.check_sparse(n, x.len(), starts.len(), dy.len(), dweight.len());
+        self.check_sparse(n, x.len(), argmax.len(), dy.len(), dweight.len());
         assert_eq!(dbias.len(), self.shape.oc, "sparse conv gradient: length of the bias of {:?}", self.shape);
-        sparse::weight_gradient(self.isa, &self.shape, x, starts, dy, dweight, dbias);
+        sparse::weight_gradient(self.isa(), &self.shape, x, argmax, dy, dweight, dbias);
     }
 
     /// As [`Conv::backward_input`].
     ///
     /// # Panics
     /// As [`Conv::sparse_backward_weight`].
-    pub fn sparse_backward_input(&self, n: usize, starts: &[u32], dy: &[f32], weight: &[f32], dx: &mut [f32]) {
-        self.check_sparse(n, dx.len(), starts.len(), dy.len(), weight.len());
-        sparse::input_gradient(self.isa, &self.shape, starts, dy, weight, dx);
+    pub fn sparse_backward_input(&self, n: usize, argmax: &[u32], dy: &[f32], weight: &[f32], dx: &mut [f32]) {
+        self.check_sparse(n, dx.len(), argmax.len(), dy.len(), weight.len());
+        sparse::input_gradient(self.isa(), &self.shape, argmax, dy, weight, dx);
     }
 
-    fn check_sparse(&self, n: usize, x_len: usize, starts: usize, dy: usize, weight: usize) {
+    fn check_sparse(&self, n: usize, x_len: usize, argmax: usize, dy: usize, weight: usize) {
         let shape = &self.shape;
         assert!(self.has_sparse_gradients(), "no sparse gradients of {shape:?}");
         assert_eq!(x_len, n * shape.x_len(), "sparse conv gradient: length of the {n} inputs of {shape:?}");
         assert_eq!(weight, shape.oc * shape.taps(), "sparse conv gradient: length of the weights of {shape:?}");
-        assert!(starts == dy && dy.is_multiple_of((n * shape.oc).max(1)), "sparse conv gradient: uneven positions");
-    }
-}
-
-per_isa! {
-    fn pack<S>(simd: S, conv: &Conv, weight: &[f32], bias: &[f32], packed: &mut [f32]) {
-        match &conv.fast_forward {
-            Some(fast) => fast.pack(simd, weight, bias, packed),
-            None => conv.sum.pack(simd, Some(bias), weight, packed),
-        }
-    }
-}
-
-per_isa! {
-    fn pack_gradient<S>(simd: S, conv: &Conv, weight: &[f32], packed: &mut [f32]) {
-        match &conv.fast_input_gradient {
-            Some(fast) => fast.pack(simd, weight, packed),
-            None => conv.input_gradient.pack(simd, weight, packed),
-        }
-    }
-}
-
-per_isa! {
-    fn fast_input_gradient<S>(
-        simd: S,
-        gradient: &winograd::InputGradient,
-        dy: &[f32],
-        packed: &[f32],
-        dx: &mut [f32],
-        scratch: &mut [f32],
-    ) {
-        gradient.run(simd, dy, packed, dx, scratch);
-    }
-}
-
-per_isa! {
-    fn forward<S>(simd: S, conv: &Conv, x: &[f32], packed: &[f32], y: &mut [f32], scratch: &mut [f32]) {
-        if let Some(fast) = &conv.fast_forward {
-            return fast.run(simd, x, packed, y, scratch);
-        }
-        let copy = &mut scratch[..conv.copy_len(FORWARD_COPIES)];
-        let sum = &conv.sum;
-        if !conv.layout.copies {
-            return sum.run(simd, x, packed, y);
-        }
-        let group = group_of(conv.layout.image(), FORWARD_COPIES);
-        let groups = x.chunks(group * conv.shape.x_len().max(1)).zip(y.chunks_mut(group * conv.shape.y_len()));
-        for (x, y) in groups {
-            let used = y.len() / conv.shape.y_len() * conv.layout.image();
-            conv.layout.copy(simd, x, &mut copy[..used]);
-            copy[used..used + MOST_LANES].fill(0.0);
-            sum.run(simd, &copy[..used + MOST_LANES], packed, y);
-        }
-    }
-}
-
-per_isa! {
-    fn backward_weight<S>(
-        simd: S,
-        conv: &Conv,
-        x: &[f32],
-        dy: &[f32],
-        dweight: &mut [f32],
-        dbias: &mut [f32],
-        scratch: &mut [f32],
-    ) {
-        if let Some(fast) = &conv.fast_weight_gradient {
-            return fast.run(simd, x, dy, dweight, dbias, scratch);
-        }
-        let (copy, scratch) = scratch.split_at_mut(conv.copy_len(GRADIENT_COPIES));
-        if !conv.layout.copies {
-            return weight_gradient::run(simd, &conv.sum, x, dy, dweight, dbias, scratch);
-        }
-        let group = group_of(conv.layout.image(), GRADIENT_COPIES);
-        let groups = x.chunks(group * conv.shape.x_len().max(1)).zip(dy.chunks(group * conv.shape.y_len()));
-        for (x, dy) in groups {
-            let used = dy.len() / conv.shape.y_len() * conv.layout.image();
-            conv.layout.copy(simd, x, &mut copy[..used]);
-            copy[used..used + MOST_LANES].fill(0.0);
-            weight_gradient::run(simd, &conv.sum, &copy[..used + MOST_LANES], dy, dweight, dbias, scratch);
-        }
+        assert!(argmax == dy && dy.is_multiple_of((n * shape.oc).max(1)), "sparse conv gradient: uneven positions");
     }
 }

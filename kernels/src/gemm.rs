@@ -6,10 +6,11 @@
 //! | at most 32 rows; rows of `B` contiguous | blocks, with `B` read where it is |
 //! | else | blocks that fit the caches, packed into panels (Goto and van de Geijn 2008) |
 //!
-//! Packing `B` costs about as much as multiplying it by 16 rows, so it does not pay for a few.
+//! Packing `B` costs about as much as multiplying it by 16 rows, so it does not pay for few rows.
 
 mod dots;
 
+use crate::matrix::{Matrix, MatrixMut, check_product};
 use crate::simd::{ALIGNMENT, Simd, align};
 
 /// Depth of a block: a panel of `A` and one of `B` of this depth stay in the first-level cache.
@@ -19,85 +20,53 @@ const BLOCK_M: usize = 96;
 /// Columns of a block of `B` (480 KiB).
 const BLOCK_N: usize = 480;
 /// The largest tile of any instruction set.
-const MOST_ROWS: usize = 8;
-const MOST_COLUMNS: usize = 48;
+const MAX_ROWS: usize = 8;
+const MAX_COLUMNS: usize = 48;
 
-/// Up to as many rows of `A`, `B` is not packed.
+/// `B` is not packed for this number of rows of `A` or fewer.
 const FEW_ROWS: usize = 32;
 
-/// Elements of scratch that [`gemm`] needs for an `m x k` times `k x n` product, at most 640 KiB.
+/// Length of the scratch of [`gemm`] for a product of `m x k` and `k x n`, at most 640 KiB.
 pub fn gemm_scratch_len(m: usize, k: usize, n: usize) -> usize {
     // A product may be computed as that of the transposes, so either size may take either part.
     let depth = k.min(BLOCK_K);
-    let a = |m: usize| (m.min(BLOCK_M) + MOST_ROWS) * depth;
-    let b = |n: usize| n.min(BLOCK_N).next_multiple_of(MOST_COLUMNS) * depth;
+    let a = |m: usize| (m.min(BLOCK_M) + MAX_ROWS) * depth;
+    let b = |n: usize| n.min(BLOCK_N).next_multiple_of(MAX_COLUMNS) * depth;
     (a(m) + b(n)).max(a(n) + b(m)) + ALIGNMENT
 }
 
-/// `C = alpha A B + beta C`.
+/// `C = alpha A B + beta C`. With `beta = 0`, the old values of `C` do not matter.
 ///
-/// # Shapes
-/// `A` is `m x k`, `B` `k x n`, `C` `m x n`. Strides are those of a row and of a column, in elements: `(k, 1)` is a
-/// row-major `m x k` matrix and `(1, m)` the same read as transposed. With `beta = 0`, what `C` holds does not matter.
 /// The order in which an element of `C` is summed depends on the sizes, the strides and the instruction set alone.
 ///
 /// # Panics
-/// If a slice is shorter than its strides ask for, two elements of `C` share a place, or `scratch` has less than
-/// [`gemm_scratch_len`] elements.
-pub fn gemm(
-    isa: crate::Isa,
-    m: usize,
-    k: usize,
-    n: usize,
-    alpha: f32,
-    a: &[f32],
-    a_strides: (usize, usize),
-    b: &[f32],
-    b_strides: (usize, usize),
-    beta: f32,
-    c: &mut [f32],
-    c_strides: (usize, usize),
-    scratch: &mut [f32],
-) {
+/// If the sizes do not match, a matrix reaches beyond its slice, two elements of `C` share a place, or `scratch` is shorter
+/// than [`gemm_scratch_len`].
+pub fn gemm(isa: crate::Isa, alpha: f32, a: Matrix, b: Matrix, beta: f32, mut c: MatrixMut, scratch: &mut [f32]) {
+    check_product("gemm", &a, &b, &c);
+    let (m, k, n) = (a.rows, a.columns, b.columns);
     if m == 0 || n == 0 {
         return;
     }
-    let last =
-        |rows: usize, columns: usize, strides: (usize, usize)| (rows - 1) * strides.0 + (columns - 1) * strides.1;
-    assert!(k == 0 || last(m, k, a_strides) < a.len(), "gemm: A is too short");
-    assert!(k == 0 || last(k, n, b_strides) < b.len(), "gemm: B is too short");
-    assert!(last(m, n, c_strides) < c.len(), "gemm: C is too short");
-    let (row, column) = c_strides;
-    let apart = (row >= 1 || m == 1) && (column >= 1 || n == 1);
-    assert!(apart && (row > (n - 1) * column || column > (m - 1) * row), "gemm: elements of C share a place");
     assert!(scratch.len() >= gemm_scratch_len(m, k, n), "gemm: scratch is too short");
-    if m <= FEW_ROWS && k > 0 && (a_strides.1 == 1 || k == 1) && (b_strides.0 == 1 || k == 1) {
-        dots::run(isa, (m, k, n), alpha, (a, a_strides.0), (b, b_strides.1), beta, (c, c_strides));
-    } else if column == 1 || row != 1 {
-        blocks(isa, (m, k, n), alpha, (a, a_strides), (b, b_strides), beta, (c, c_strides), scratch);
-    } else {
-        // The rows of C' are contiguous: C' = B' A'.
-        let turned = |(row, column): (usize, usize)| (column, row);
-        let (a_strides, b_strides) = (turned(a_strides), turned(b_strides));
-        blocks(isa, (n, k, m), alpha, (b, b_strides), (a, a_strides), beta, (c, turned(c_strides)), scratch);
+    if m <= FEW_ROWS && k > 0 && (a.strides.1 == 1 || k == 1) && (b.strides.0 == 1 || k == 1) {
+        return dots::run(isa, alpha, a, b, beta, &mut c);
     }
+    let (row, column) = c.strides;
+    if column == 1 || row != 1 {
+        return blocks(isa, alpha, a, b, beta, &mut c, scratch);
+    }
+    // The rows of C' are contiguous: C' = B' A'.
+    let mut turned = MatrixMut { values: c.values, rows: c.columns, columns: c.rows, strides: (column, row) };
+    blocks(isa, alpha, b.transposed(), a.transposed(), beta, &mut turned, scratch);
 }
 
 per_isa! {
-    fn blocks<S>(
-        simd: S,
-        sizes: (usize, usize, usize),
-        alpha: f32,
-        a: (&[f32], (usize, usize)),
-        b: (&[f32], (usize, usize)),
-        beta: f32,
-        c: (&mut [f32], (usize, usize)),
-        scratch: &mut [f32],
-    ) {
+    fn blocks<S>(simd: S, alpha: f32, a: Matrix, b: Matrix, beta: f32, c: &mut MatrixMut, scratch: &mut [f32]) {
         if S::MANY_REGISTERS {
-            blocks_of::<S, 8, 3>(simd, sizes, alpha, a, b, beta, c, scratch);
+            blocks_of::<S, 8, 3>(simd, alpha, a, b, beta, c, scratch);
         } else {
-            blocks_of::<S, 6, 2>(simd, sizes, alpha, a, b, beta, c, scratch);
+            blocks_of::<S, 6, 2>(simd, alpha, a, b, beta, c, scratch);
         }
     }
 }
@@ -105,51 +74,54 @@ per_isa! {
 #[inline(always)]
 fn blocks_of<S: Simd, const MR: usize, const NV: usize>(
     simd: S,
-    (m, k, n): (usize, usize, usize),
     alpha: f32,
-    (a, a_strides): (&[f32], (usize, usize)),
-    (b, b_strides): (&[f32], (usize, usize)),
+    a: Matrix,
+    b: Matrix,
     beta: f32,
-    (c, c_strides): (&mut [f32], (usize, usize)),
+    c: &mut MatrixMut,
     scratch: &mut [f32],
 ) {
-    let columns = S::LANES * NV;
-    let packs = m > FEW_ROWS || b_strides.1 != 1;
-    let (packed_b, packed_a) = align(scratch).split_at_mut(n.min(BLOCK_N).next_multiple_of(columns) * k.min(BLOCK_K));
+    let (m, k, n) = (a.rows, a.columns, b.columns);
+    let tile_columns = S::LANES * NV;
+    let packs = m > FEW_ROWS || b.strides.1 != 1;
+    let (packed_b, packed_a) =
+        align(scratch).split_at_mut(n.min(BLOCK_N).next_multiple_of(tile_columns) * k.min(BLOCK_K));
     for first_n in (0..n).step_by(BLOCK_N) {
         let block_n = BLOCK_N.min(n - first_n);
         // A product over nothing still scales C: one empty block.
         for first_k in (0..k.max(1)).step_by(BLOCK_K) {
             let block_k = BLOCK_K.min(k - first_k);
             let beta = if first_k == 0 { beta } else { 1.0 };
-            let from = (first_k * b_strides.0 + first_n * b_strides.1, b_strides.0, b_strides.1);
+            let b_origin = first_k * b.strides.0 + first_n * b.strides.1;
             if packs {
-                pack(b, from, block_k, block_n, columns, packed_b);
+                let block = Block { values: b.values, origin: b_origin, step: b.strides.0, stride: b.strides.1 };
+                pack(block, block_k, block_n, tile_columns, packed_b);
             }
             for first_m in (0..m).step_by(BLOCK_M) {
                 let block_m = BLOCK_M.min(m - first_m);
-                let from_a = (first_m * a_strides.0 + first_k * a_strides.1, a_strides.1, a_strides.0);
-                pack(a, from_a, block_k, block_m, MR, packed_a);
-                for j in (0..block_n).step_by(columns) {
+                let origin = first_m * a.strides.0 + first_k * a.strides.1;
+                let block = Block { values: a.values, origin, step: a.strides.1, stride: a.strides.0 };
+                pack(block, block_k, block_m, MR, packed_a);
+                for j in (0..block_n).step_by(tile_columns) {
                     for i in (0..block_m).step_by(MR) {
                         let panel_a = &packed_a[i * block_k..][..MR * block_k];
-                        let (rows, wide) = (MR.min(block_m - i), columns.min(block_n - j));
+                        let (rows, columns) = (MR.min(block_m - i), tile_columns.min(block_n - j));
                         // An empty block has no panel, and an unpacked one ends with its last element.
                         let tile = if block_k == 0 {
                             [[simd.splat(0.0); NV]; MR]
                         } else if packs {
-                            let panel_b = &packed_b[j * block_k..][..columns * block_k];
-                            tile::<S, MR, NV, false>(simd, panel_a, panel_b, columns, columns)
+                            let panel_b = &packed_b[j * block_k..][..tile_columns * block_k];
+                            tile::<S, MR, NV, false>(simd, panel_a, panel_b, tile_columns, tile_columns)
                         } else {
-                            let panel_b = &b[from.0 + j..][..(block_k - 1) * b_strides.0 + wide];
-                            if wide == columns {
-                                tile::<S, MR, NV, false>(simd, panel_a, panel_b, b_strides.0, columns)
+                            let panel_b = &b.values[b_origin + j..][..(block_k - 1) * b.strides.0 + columns];
+                            if columns == tile_columns {
+                                tile::<S, MR, NV, false>(simd, panel_a, panel_b, b.strides.0, tile_columns)
                             } else {
-                                tile::<S, MR, NV, true>(simd, panel_a, panel_b, b_strides.0, wide)
+                                tile::<S, MR, NV, true>(simd, panel_a, panel_b, b.strides.0, columns)
                             }
                         };
-                        let at = (first_m + i) * c_strides.0 + (first_n + j) * c_strides.1;
-                        write(simd, &tile, alpha, beta, &mut c[at..], c_strides, rows, wide);
+                        let at = (first_m + i) * c.strides.0 + (first_n + j) * c.strides.1;
+                        write(simd, &tile, alpha, beta, &mut c.values[at..], c.strides, rows, columns);
                     }
                 }
             }
@@ -157,17 +129,19 @@ fn blocks_of<S: Simd, const MR: usize, const NV: usize>(
     }
 }
 
-/// Packs a block into panels of `width`: within a panel, `depth` steps of `width` elements; what is missing is 0.
-/// Element `(step, i)` of the block is `from[origin + step * step_stride + i * stride]`.
+/// A block of a matrix that is packed step by step: element `i` of a step is `values[origin + step_number * step + i * stride]`.
+#[derive(Clone, Copy)]
+struct Block<'a> {
+    values: &'a [f32],
+    origin: usize,
+    step: usize,
+    stride: usize,
+}
+
+/// Packs `depth` steps of `len` elements into panels of `width` elements a step; missing elements are 0.
 #[inline(always)]
-fn pack(
-    from: &[f32],
-    (origin, step_stride, stride): (usize, usize, usize),
-    depth: usize,
-    len: usize,
-    width: usize,
-    to: &mut [f32],
-) {
+fn pack(block: Block, depth: usize, len: usize, width: usize, to: &mut [f32]) {
+    let Block { values: from, origin, step: step_stride, stride } = block;
     if depth == 0 {
         return;
     }

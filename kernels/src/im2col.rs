@@ -1,65 +1,134 @@
 //! An image as the matrix of its patches, and back (Chellapilla et al. 2006).
 //!
-//! With the patches of an image as rows, a convolution is the product `y = W patches'`, where `W` is `[oc][taps]` and
-//! `taps` is `c * kh * kw`. This works for every kernel, stride and padding, but writes each element of the image up to
-//! `kh * kw` times.
+//! The identity: with `taps = C * KH * KW` and `pixels = OH * OW`, the *columns* of an image are a matrix `[taps][pixels]`,
+//! written `[C*KH*KW, OH*OW]`. Column `oy * OW + ox` holds the patch of the image that output `(oy, ox)` sees. Row
+//! `(c * KH + ky) * KW + kx` holds what tap `(c, ky, kx)` of the kernel sees at each output:
+//!
+//! ```text
+//! columns[(c, ky, kx)][(oy, ox)] = x[c][oy * stride_h + ky - pad_top][ox * stride_w + kx - pad_left],   0 outside the image
+//! ```
+//!
+//! A convolution is then one matrix product: `y [OC, OH*OW] = weight [OC, C*KH*KW] * columns [C*KH*KW, OH*OW]`.
+//! This holds for any kernel, stride and padding. The price is memory: an element of the image is written up to `KH * KW`
+//! times.
+//!
+//! # Example
+//! A 3x3 image and a 2x2 kernel: 4 taps, 4 outputs. The first column is the patch in the upper left corner.
+//!
+//! ```
+//! use steersman_kernels::conv::ConvShape;
+//! use steersman_kernels::im2col::{col2im, im2col};
+//!
+//! let [pad_top, pad_bottom, pad_left, pad_right] = [0; 4];
+//! let shape = ConvShape { c: 1, h: 3, w: 3, oc: 1, kh: 2, kw: 2, stride_h: 1, stride_w: 1,
+//!                         pad_top, pad_bottom, pad_left, pad_right };
+//! let x = [1., 2., 3.,
+//!          4., 5., 6.,
+//!          7., 8., 9.];
+//! let mut columns = [0.; 16];
+//! im2col(&shape, &x, &mut columns);
+//! assert_eq!(columns, [1., 2., 4., 5.,    // tap (0, 0) at the four outputs
+//!                      2., 3., 5., 6.,    // tap (0, 1)
+//!                      4., 5., 7., 8.,    // tap (1, 0)
+//!                      5., 6., 8., 9.]);  // tap (1, 1)
+//!
+//! // The way back adds up: the middle of the image lies in four patches.
+//! let mut dx = [0.; 9];
+//! col2im(&shape, &[1.; 16], &mut dx);
+//! assert_eq!(dx, [1., 2., 1.,
+//!                 2., 4., 2.,
+//!                 1., 2., 1.]);
+//! ```
 
-use crate::conv::ConvShape;
+use std::ops::Range;
 
-/// Calls `visit` for each run of `kw` or fewer neighbouring elements that a patch shares with the image, with where it
-/// begins in the image and in the patches and its length.
-#[inline(always)]
-fn for_each_run(shape: &ConvShape, mut visit: impl FnMut(usize, usize, usize)) {
+use crate::conv_shape::ConvShape;
+
+/// The outputs `o` along one axis, of `outputs`, whose tap `k` falls into the image: `0 <= o * stride + k - pad < size`.
+fn inside(size: usize, pad: usize, stride: usize, k: usize, outputs: usize) -> Range<usize> {
+    let end = (size + pad).saturating_sub(k).div_ceil(stride).min(outputs);
+    pad.saturating_sub(k).div_ceil(stride).min(end)..end
+}
+
+/// Checks the lengths of one image and its columns.
+fn check(kernel: &str, shape: &ConvShape, image: usize, columns: usize) {
+    assert_eq!(image, shape.x_len(), "{kernel}: length of the image of {shape:?}");
+    assert_eq!(columns, shape.taps() * shape.out_pixels(), "{kernel}: length of the columns of {shape:?}");
+}
+
+/// Writes the columns of one image.
+///
+/// # Shapes
+/// `x`: `[c][h][w]`, `columns`: `[c * kh * kw][out_h * out_w]`, overwritten.
+///
+/// # Panics
+/// If a slice has another length.
+pub fn im2col(shape: &ConvShape, x: &[f32], columns: &mut [f32]) {
+    check("im2col", shape, x.len(), columns.len());
     let &ConvShape { c, h, w, kh, kw, stride_h, stride_w, pad_top, pad_left, .. } = shape;
     let (out_h, out_w) = (shape.out_h(), shape.out_w());
-    for oy in 0..out_h {
-        let ky_first = pad_top.saturating_sub(oy * stride_h).min(kh);
-        let ky_end = (h + pad_top).saturating_sub(oy * stride_h).clamp(ky_first, kh);
-        for ox in 0..out_w {
-            let kx_first = pad_left.saturating_sub(ox * stride_w).min(kw);
-            let kx_end = (w + pad_left).saturating_sub(ox * stride_w).clamp(kx_first, kw);
-            if kx_first == kx_end {
-                continue;
-            }
-            let patch = (oy * out_w + ox) * c * kh * kw;
-            let ix = ox * stride_w + kx_first - pad_left;
-            for channel in 0..c {
-                for ky in ky_first..ky_end {
-                    let iy = oy * stride_h + ky - pad_top;
-                    let in_patch = patch + (channel * kh + ky) * kw + kx_first;
-                    visit((channel * h + iy) * w + ix, in_patch, kx_end - kx_first);
+    if columns.is_empty() {
+        return;
+    }
+    let mut rows = columns.chunks_exact_mut(out_w);
+    for channel in 0..c {
+        for ky in 0..kh {
+            for kx in 0..kw {
+                let (oys, oxs) = (inside(h, pad_top, stride_h, ky, out_h), inside(w, pad_left, stride_w, kx, out_w));
+                for (oy, row) in rows.by_ref().take(out_h).enumerate() {
+                    if !oys.contains(&oy) || oxs.is_empty() {
+                        row.fill(0.0);
+                        continue;
+                    }
+                    let (iy, ix) = (oy * stride_h + ky - pad_top, oxs.start * stride_w + kx - pad_left);
+                    let x = &x[(channel * h + iy) * w + ix..(channel * h + iy + 1) * w];
+                    row[..oxs.start].fill(0.0);
+                    row[oxs.end..].fill(0.0);
+                    let row = &mut row[oxs.clone()];
+                    if stride_w == 1 {
+                        row.copy_from_slice(&x[..row.len()]);
+                    } else {
+                        row.iter_mut().zip(x.iter().step_by(stride_w)).for_each(|(to, &x)| *to = x);
+                    }
                 }
             }
         }
     }
 }
 
-/// Checks the lengths of one image and its patches.
-fn check(kernel: &str, shape: &ConvShape, image: usize, patches: usize) {
-    assert_eq!(image, shape.c * shape.h * shape.w, "{kernel}: length of the image of {shape:?}");
-    let pixels = shape.out_h() * shape.out_w();
-    assert_eq!(patches, pixels * shape.c * shape.kh * shape.kw, "{kernel}: length of the patches of {shape:?}");
-}
-
-/// Writes the patches of one image.
+/// Adds each element of the columns to the element of the image it came from: the transpose of [`im2col`].
 ///
 /// # Shapes
-/// `x`: `[c][h][w]`, `patches`: `[out_h * out_w][c * kh * kw]`, overwritten; what lies outside the image is 0.
-pub fn im2col(shape: &ConvShape, x: &[f32], patches: &mut [f32]) {
-    check("im2col", shape, x.len(), patches.len());
-    patches.fill(0.0);
-    for_each_run(shape, |image, patch, len| patches[patch..patch + len].copy_from_slice(&x[image..image + len]));
-}
-
-/// Adds each element of the patches to the element of the image it came from: the transpose of [`im2col`].
+/// As for [`im2col`]. What `columns` holds for positions outside the image is ignored.
 ///
-/// # Shapes
-/// As for [`im2col`]; what `patches` holds for positions outside the image is ignored.
-pub fn col2im(shape: &ConvShape, patches: &[f32], dx: &mut [f32]) {
-    check("col2im", shape, dx.len(), patches.len());
-    for_each_run(shape, |image, patch, len| {
-        for (dx, &patch) in dx[image..image + len].iter_mut().zip(&patches[patch..patch + len]) {
-            *dx += patch;
+/// # Panics
+/// If a slice has another length.
+pub fn col2im(shape: &ConvShape, columns: &[f32], dx: &mut [f32]) {
+    check("col2im", shape, dx.len(), columns.len());
+    let &ConvShape { c, h, w, kh, kw, stride_h, stride_w, pad_top, pad_left, .. } = shape;
+    let (out_h, out_w) = (shape.out_h(), shape.out_w());
+    if columns.is_empty() {
+        return;
+    }
+    let mut rows = columns.chunks_exact(out_w);
+    for channel in 0..c {
+        for ky in 0..kh {
+            for kx in 0..kw {
+                let (oys, oxs) = (inside(h, pad_top, stride_h, ky, out_h), inside(w, pad_left, stride_w, kx, out_w));
+                for (oy, row) in rows.by_ref().take(out_h).enumerate() {
+                    if !oys.contains(&oy) || oxs.is_empty() {
+                        continue;
+                    }
+                    let (iy, ix) = (oy * stride_h + ky - pad_top, oxs.start * stride_w + kx - pad_left);
+                    let dx = &mut dx[(channel * h + iy) * w + ix..(channel * h + iy + 1) * w];
+                    let row = &row[oxs.clone()];
+                    if stride_w == 1 {
+                        dx.iter_mut().zip(row).for_each(|(dx, &value)| *dx += value);
+                    } else {
+                        dx.iter_mut().step_by(stride_w).zip(row).for_each(|(dx, &value)| *dx += value);
+                    }
+                }
+            }
         }
-    });
+    }
 }

@@ -83,6 +83,11 @@ impl Isa {
         }
     }
 
+    /// Whether there are 32 vector registers and not 16; as [`MANY_REGISTERS`](crate::simd::Simd::MANY_REGISTERS).
+    pub(crate) fn has_many_registers(self) -> bool {
+        matches!(self.0, Level::Neon | Level::Avx512)
+    }
+
     pub(crate) fn level(self) -> Level {
         self.0
     }

@@ -65,44 +65,44 @@ per_isa! {
 }
 
 per_isa! {
-    /// As [`max_forward`], and tells in `places`, as long as `y`, where the first maximum of each window lies in its plane:
-    /// row times `pitch` plus column. Only for windows of 4 columns that neither overlap nor leave gaps.
-    pub fn max_forward_with_places<S>(
+    /// As [`max_forward`], and writes to `argmax`, as long as `y`, the index of the first maximum of each window in its plane:
+    /// `row * pitch + column`. Only for windows of 4 columns that neither overlap nor leave gaps.
+    pub fn max_forward_with_argmax<S>(
         simd: S,
         shape: &PoolShape,
         n: usize,
         pitch: usize,
         x: &[f32],
         y: &mut [f32],
-        places: &mut [u32],
+        argmax: &mut [u32],
     ) {
-        shape.check("max_forward_with_places", n, x.len(), y.len());
+        shape.check("max_forward_with_argmax", n, x.len(), y.len());
         let &PoolShape { h, w, kh, kw, stride_h, stride_w, .. } = shape;
-        assert!((kw, stride_w, stride_h) == (4, 4, kh), "max_forward_with_places: not for windows of {shape:?}");
-        assert_eq!(places.len(), y.len(), "max_forward_with_places: y and places differ in length");
+        assert!((kw, stride_w, stride_h) == (4, 4, kh), "max_forward_with_argmax: not for windows of {shape:?}");
+        assert_eq!(argmax.len(), y.len(), "max_forward_with_argmax: y and argmax differ in length");
         if y.is_empty() {
             return;
         }
         let (out_h, out_w) = (shape.out_h(), shape.out_w());
-        let outputs = y.chunks_exact_mut(out_h * out_w).zip(places.chunks_exact_mut(out_h * out_w));
-        for (x, (y, places)) in x.chunks_exact(h * w).zip(outputs) {
-            let rows = y.chunks_exact_mut(out_w).zip(places.chunks_exact_mut(out_w));
-            for (oy, (y, places)) in rows.enumerate() {
+        let outputs = y.chunks_exact_mut(out_h * out_w).zip(argmax.chunks_exact_mut(out_h * out_w));
+        for (x, (y, argmax)) in x.chunks_exact(h * w).zip(outputs) {
+            let rows = y.chunks_exact_mut(out_w).zip(argmax.chunks_exact_mut(out_w));
+            for (oy, (y, argmax)) in rows.enumerate() {
                 let rows = &x[oy * kh * w..(oy + 1) * kh * w];
-                let windows = y.chunks_mut(STRIP / 4).zip(places.chunks_mut(STRIP / 4));
-                for (strip, (y, places)) in windows.enumerate() {
+                let windows = y.chunks_mut(STRIP / 4).zip(argmax.chunks_mut(STRIP / 4));
+                for (strip, (y, argmax)) in windows.enumerate() {
                     let first = (oy * kh * pitch + strip * STRIP) as u32;
-                    max_of_strip(simd, &rows[strip * STRIP..], w, kh, first, pitch as u32, y, places);
+                    max_of_strip(simd, &rows[strip * STRIP..], w, kh, first, pitch as u32, y, argmax);
                 }
             }
         }
     }
 }
 
-/// Columns at a time, in [`max_forward_with_places`].
+/// Columns at a time, in [`max_forward_with_argmax`].
 const STRIP: usize = 64;
 
-/// A row of at most `STRIP / 4` windows of 4 columns and `kh` rows, the first of which begins at `rows[0]`, the place
+/// A row of at most `STRIP / 4` windows of 4 columns and `kh` rows, the first of which begins at `rows[0]`, with index
 /// `first`.
 #[inline(always)]
 fn max_of_strip<S: Simd>(
@@ -113,11 +113,11 @@ fn max_of_strip<S: Simd>(
     first: u32,
     pitch: u32,
     y: &mut [f32],
-    places: &mut [u32],
+    argmax: &mut [u32],
 ) {
     // Down the columns first, vector by vector: the largest of each and its row.
     let columns = 4 * y.len();
-    let (mut most, mut row_of) = ([f32::NEG_INFINITY; STRIP], [0.0f32; STRIP]);
+    let (mut max, mut row_of) = ([f32::NEG_INFINITY; STRIP], [0.0f32; STRIP]);
     let whole = columns - columns % S::LANES;
     for at in (0..whole).step_by(S::LANES) {
         let (mut best, mut best_row) = (get(simd, rows, at), simd.splat(0.0));
@@ -126,7 +126,7 @@ fn max_of_strip<S: Simd>(
             best_row = simd.select_greater(x, best, simd.splat(ky as f32), best_row);
             best = simd.select_greater(x, best, x, best);
         }
-        put(simd, &mut most, at, best);
+        put(simd, &mut max, at, best);
         put(simd, &mut row_of, at, best_row);
     }
     if whole < columns {
@@ -138,20 +138,20 @@ fn max_of_strip<S: Simd>(
             best_row = simd.select_greater(x, best, simd.splat(ky as f32), best_row);
             best = simd.select_greater(x, best, x, best);
         }
-        put(simd, &mut most, whole, best);
+        put(simd, &mut max, whole, best);
         put(simd, &mut row_of, whole, best_row);
     }
     // Then across the four columns of each window; of equal values the one in the upper row, then the left one.
-    let windows = most.as_chunks::<4>().0.iter().zip(row_of.as_chunks::<4>().0);
-    for (i, ((y, place), (most, row_of))) in y.iter_mut().zip(places).zip(windows).enumerate() {
-        let (mut best, mut best_row, mut column) = (most[0], row_of[0], 0);
+    let windows = max.as_chunks::<4>().0.iter().zip(row_of.as_chunks::<4>().0);
+    for (i, ((y, argmax), (max, row_of))) in y.iter_mut().zip(argmax).zip(windows).enumerate() {
+        let (mut best, mut best_row, mut column) = (max[0], row_of[0], 0);
         for j in 1..4 {
-            if most[j] > best || (most[j] == best && row_of[j] < best_row) {
-                (best, best_row, column) = (most[j], row_of[j], j as u32);
+            if max[j] > best || (max[j] == best && row_of[j] < best_row) {
+                (best, best_row, column) = (max[j], row_of[j], j as u32);
             }
         }
         *y = best;
-        *place = first + best_row as u32 * pitch + 4 * i as u32 + column;
+        *argmax = first + best_row as u32 * pitch + 4 * i as u32 + column;
     }
 }
 
@@ -159,11 +159,11 @@ fn max_of_strip<S: Simd>(
 #[inline(always)]
 fn max_of_blocks<const K: usize>(y: &mut [f32], row: &[f32]) {
     for (y, block) in y.iter_mut().zip(row.as_chunks::<K>().0) {
-        let mut most = *y;
+        let mut max = *y;
         for &x in block {
-            most = if x > most { x } else { most };
+            max = if x > max { x } else { max };
         }
-        *y = most;
+        *y = max;
     }
 }
 

@@ -2,27 +2,18 @@
 //!
 //! Names, arguments and layouts are those of the kernels, without the [`crate::Isa`]; sums are taken in `f64`.
 
-use crate::conv::ConvShape;
+use crate::conv_shape::ConvShape;
+use crate::matrix::{Matrix, MatrixMut};
 use crate::pool::PoolShape;
 use crate::update::AdamStep;
 
-/// See [`crate::gemm::gemm`].
-pub fn gemm(
-    (m, k, n): (usize, usize, usize),
-    alpha: f32,
-    (a, a_strides): (&[f32], (usize, usize)),
-    (b, b_strides): (&[f32], (usize, usize)),
-    beta: f32,
-    (c, c_strides): (&mut [f32], (usize, usize)),
-) {
-    for i in 0..m {
-        for j in 0..n {
-            let mut sum = 0.0;
-            for p in 0..k {
-                sum +=
-                    f64::from(a[i * a_strides.0 + p * a_strides.1]) * f64::from(b[p * b_strides.0 + j * b_strides.1]);
-            }
-            let c = &mut c[i * c_strides.0 + j * c_strides.1];
+/// See [`crate::gemm::gemm`] and [`crate::sgemm::sgemm`].
+pub fn gemm(alpha: f32, a: Matrix, b: Matrix, beta: f32, c: MatrixMut) {
+    let at = |matrix: Matrix, i: usize, j: usize| f64::from(matrix.values[i * matrix.strides.0 + j * matrix.strides.1]);
+    for i in 0..a.rows {
+        for j in 0..b.columns {
+            let sum: f64 = (0..a.columns).map(|p| at(a, i, p) * at(b, p, j)).sum();
+            let c = &mut c.values[i * c.strides.0 + j * c.strides.1];
             let old = if beta == 0.0 { 0.0 } else { f64::from(beta) * f64::from(*c) };
             *c = (old + f64::from(alpha) * sum) as f32;
         }

@@ -5,8 +5,9 @@ use std::time::Instant;
 use clap::Args;
 use rayon::prelude::*;
 use serde::Serialize;
-use steersman_kernels::Isa;
+use steersman_kernels::conv::ConvAlgorithm;
 use steersman_kernels::peak::measure_peak_gflops;
+use steersman_kernels::{Backend, Isa};
 
 use super::{RecipeArgs, pool, print_json};
 use crate::engine::network::{InferencePlan, Network, Parameters, StageTime, StepInput, TrainingPlan};
@@ -33,6 +34,9 @@ pub struct BenchArgs {
     /// Threads; 0 is one for each core
     #[arg(long, default_value_t = 0)]
     threads: usize,
+    /// How convolutions are computed: auto (the fastest for each shape) or im2col (the textbook way) [default: auto]
+    #[arg(long, value_name = "NAME")]
+    algorithm: Option<ConvAlgorithm>,
     /// Seconds for each of the measurements
     #[arg(long, default_value_t = 3.0)]
     seconds: f64,
@@ -61,6 +65,8 @@ struct BenchResult {
     /// Absent where the system does not tell.
     peak_rss_mb: Option<f64>,
     isa: &'static str,
+    /// How convolutions are computed: `auto` or `im2col`.
+    algorithm: &'static str,
     threads: usize,
     /// With `--profile`.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -102,7 +108,9 @@ pub fn run(args: BenchArgs, started: Instant) -> Result<()> {
         return print_json(&result);
     }
     let share = 100.0 * result.train_gflops / result.peak_gflops;
-    println!("{}, batch {}, {} threads, {}", recipe.name, args.batch, result.threads, result.isa);
+    let BenchResult { threads, isa, algorithm, .. } = result;
+    let algorithm = if algorithm == ConvAlgorithm::Auto.name() { String::new() } else { format!(", {algorithm}") };
+    println!("{}, batch {}, {threads} threads, {isa}{algorithm}", recipe.name, args.batch);
     println!(
         "training      {:>9.0} images/s   {:.1} GFLOP/s, {share:.1} % of {:.0}",
         result.train_images_per_second, result.train_gflops, result.peak_gflops
@@ -120,7 +128,8 @@ pub fn run(args: BenchArgs, started: Instant) -> Result<()> {
 }
 
 fn measure(recipe: &Recipe, args: &BenchArgs, started: Instant) -> Result<BenchResult> {
-    let network = recipe.network(Isa::best())?;
+    let conv = args.algorithm.unwrap_or_else(ConvAlgorithm::of_environment);
+    let network = recipe.network(Backend { isa: Isa::best(), conv })?;
     let mut parameters = network.initialize(1);
     // The first step waits for its own batch alone, as in training.
     let mut x = vec![random_numbers(args.batch * network.input().len(), 0)];
@@ -174,6 +183,7 @@ fn measure(recipe: &Recipe, args: &BenchArgs, started: Instant) -> Result<BenchR
         first_step_s,
         peak_rss_mb: peak_rss_mb(),
         isa: network.isa().name(),
+        algorithm: conv.name(),
         threads: rayon::current_num_threads(),
         profile,
     })

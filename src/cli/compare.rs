@@ -7,7 +7,7 @@ use clap::Args;
 use super::refuse_existing;
 use crate::error::Result;
 use crate::files::atomic_file;
-use crate::report::comparison;
+use crate::report::pages::comparison;
 
 /// Lay runs side by side on one page: curves, figures, recipes, drives
 #[derive(Debug, Args)]

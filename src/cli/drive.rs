@@ -1,7 +1,6 @@
 //! `steersman drive`: closed-loop driving in the simulator.
 
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicBool, Ordering};
 
 use clap::Args;
 use serde::Serialize;
@@ -14,14 +13,15 @@ use crate::error::{Error, Result};
 use crate::files::new_folder::NewFolder;
 use crate::live::messages::Hello;
 use crate::live::{DEFAULT_PORT, Live, Watch};
+use crate::observer::StopSignal;
 use crate::pilot::Pilot;
-use crate::report::map;
-use crate::report::video::Onlooker;
+use crate::report::charts::map;
 use crate::report::video::drive::DriveVideo;
-use crate::report::video::panel::Names;
+use crate::report::video::onlooker::Onlooker;
+use crate::report::video::painter::Captions;
 use crate::simulator::trial::drive::drive;
-use crate::simulator::trial::drive::write_trajectories;
 use crate::simulator::trial::statistics::PairedTest;
+use crate::simulator::trial::trajectory::write_trajectories;
 use crate::simulator::{
     DriveOptions, DriveResult, DriveSummary, Driver, Expert, Speed, Track, Zero, compare, drive_observed,
 };
@@ -201,7 +201,7 @@ impl Wheel {
             }
             _ => None,
         };
-        let names = Names {
+        let names = Captions {
             title: format!("{}, seed {}", track.name(), args.seed),
             subtitle: args.model.clone(),
             model: Some(if matches!(self, Wheel::Model(_)) { "model" } else { "driver" }),
@@ -217,16 +217,12 @@ impl Wheel {
         track: &Track,
         options: &DriveOptions,
         args: &DriveArgs,
-        stop: &AtomicBool,
+        stop: &StopSignal,
     ) -> Result<()> {
-        let bar = ShareBar::new("filming");
-        let mut progress = |share| {
-            bar.set(share);
-            !stop.load(Ordering::Relaxed)
-        };
+        let mut bar = ShareBar::new("filming", stop);
         let mut driver = self.driver();
         let (summary, stopped) =
-            video.film(track, driver.as_mut(), &options.of_run(false), options.seed, &mut progress)?;
+            video.film(track, driver.as_mut(), &options.trial_options(false), options.seed, &mut bar)?;
         drop(bar);
         if let Some(path) = &args.video {
             tell_video(path, &summary);
@@ -240,19 +236,15 @@ impl Wheel {
         options: &DriveOptions,
         name: &str,
         live: Option<&Live>,
-        stop: &AtomicBool,
+        stop: &StopSignal,
     ) -> Result<DriveResult> {
         let new_driver = || Ok(self.driver());
         let mut result = if let Some(live) = live {
             let pilot = if let Wheel::Model(pilot) = self { Some(&**pilot) } else { None };
             drive_observed(track, new_driver, options, &mut Watch::new(live, name, pilot, options.runs, stop))?
         } else {
-            let bar = ShareBar::new(format!("{name} on {}", track.name()));
-            let progress = |share| {
-                bar.set(share);
-                !stop.load(Ordering::Relaxed)
-            };
-            drive(track, new_driver, options, &progress)?
+            let mut bar = ShareBar::new(format!("{name} on {}", track.name()), stop);
+            drive(track, new_driver, options, &mut bar)?
         };
         if let Wheel::Model(pilot) = self {
             result.summary.trained_on_held_out = pilot.trained_on_held_out().to_vec();

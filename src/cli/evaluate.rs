@@ -10,11 +10,11 @@ use steersman_kernels::Isa;
 
 use super::{or_dash, pool, print_json};
 use crate::dataset::held_out::trained_on_held_out;
-use crate::dataset::{self, Camera, Recording};
+use crate::dataset::{self, Recording, View};
 use crate::error::{Error, Result};
+use crate::metrics::{Metrics, Prediction};
 use crate::model_file::Model;
 use crate::pilot::Pilot;
-use crate::report::{Metrics, Prediction};
 
 /// Compare a model's steering with what was recorded: centre camera, every usable row
 #[derive(Debug, Args)]
@@ -98,7 +98,7 @@ pub fn run(args: EvaluateArgs) -> Result<()> {
 fn predict(pilot: &Pilot, recording: &Recording, sessions_before: usize) -> Vec<Prediction> {
     let session_of = |row: usize| recording.sessions.partition_point(|session| session.end <= row);
     let predict_row = |pilot: &mut Pilot, row: usize| {
-        let path = recording.image_path(row, Camera::Centre)?;
+        let path = recording.image_path(row, View::Centre)?;
         match pilot.steer_file(&path) {
             Ok(steering) => Some(Prediction {
                 steering,

@@ -4,14 +4,14 @@ use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
 
-use super::progress::Progress;
-use super::share_bar::Bars;
+use super::progress::JobDisplay;
 use super::{RecipeArgs, or_dash, pool, print_json, refuse_existing, stop_on_ctrl_c};
 use crate::dataset::held_out::{self, trained_on_held_out};
 use crate::error::{Error, Result};
-use crate::main_job::experiment::{self, Plan, Subject, Trial, takes, write_csv};
+use crate::main_job::experiment::{self, ExperimentEvent, ExperimentRow, Plan, Subject, takes, write_csv};
 use crate::main_job::job::{RECORDINGS, training_set};
 use crate::main_job::training_set::RANDOM_TRACKS;
+use crate::observer::Observer;
 use crate::simulator::Track;
 
 /// Compare splits or colour spaces: what the validation loss promises beside what the drive delivers
@@ -87,11 +87,14 @@ pub fn run(args: ExperimentArgs) -> Result<()> {
         Track::load(track)?;
     }
     let stop = stop_on_ctrl_c()?;
-    let (pool, bars, mut progress) = (pool(args.threads)?, Bars, Progress::new());
+    let (pool, mut display) = (pool(args.threads)?, JobDisplay::new(&stop));
     // A file that cannot be written is told before hours are spent.
     let out = new_csv(args.out, args.subject)?;
     let recordings = match args.recordings.is_empty() {
-        true => pool.install(|| training_set(RECORDINGS.as_ref(), &takes(args.random_tracks as usize), &bars, &stop)),
+        true => {
+            let takes = takes(args.random_tracks as usize);
+            pool.install(|| training_set(RECORDINGS.as_ref(), &takes, &mut display, &stop))
+        }
         false => Ok(args.recordings),
     };
     let recordings = recordings.inspect_err(|_| drop(std::fs::remove_file(&out)))?;
@@ -101,11 +104,14 @@ pub fn run(args: ExperimentArgs) -> Result<()> {
     };
     let plan = Plan { subject, recipe, seeds, recordings, tracks, runs, cache_mib: args.cache };
     let mut done = Vec::new();
-    let mut told = |trial: &Trial| {
-        done.push(trial.clone());
-        write_csv(&out, &done)
+    let mut observer = |event| match event {
+        ExperimentEvent::Job(event) => display.observe(event),
+        ExperimentEvent::Row(trial) => {
+            done.push(trial);
+            write_csv(&out, &done)
+        }
     };
-    let result = pool.install(|| experiment::run(&plan, &mut progress, &bars, &stop, &mut told)).map(drop);
+    let result = pool.install(|| experiment::run(&plan, &mut observer, &stop)).map(drop);
     // After a stop or an error too, what is done is shown and kept.
     if done.is_empty() {
         std::fs::remove_file(&out).map_err(Error::io(&out))?;
@@ -143,7 +149,7 @@ fn new_csv(out: Option<PathBuf>, subject: SubjectArg) -> Result<PathBuf> {
     Ok(out)
 }
 
-fn print_table(plan: &Plan, trials: &[Trial]) {
+fn print_table(plan: &Plan, trials: &[ExperimentRow]) {
     println!(
         "recipe {}, {} epochs, {} recordings; {} trainings of each; driven: {}, {} runs of a lap on each",
         plan.recipe.name,
@@ -158,9 +164,9 @@ fn print_table(plan: &Plan, trials: &[Trial]) {
     let mut variants: Vec<&str> = trials.iter().map(|trial| trial.variant.as_str()).collect();
     variants.dedup();
     for variant in variants {
-        let of: Vec<&Trial> = trials.iter().filter(|trial| trial.variant == variant).collect();
-        let mean = |f: &dyn Fn(&Trial) -> f64| of.iter().map(|trial| f(trial)).sum::<f64>() / of.len() as f64;
-        let present = |f: &dyn Fn(&Trial) -> Option<f64>| {
+        let of: Vec<&ExperimentRow> = trials.iter().filter(|trial| trial.variant == variant).collect();
+        let mean = |f: &dyn Fn(&ExperimentRow) -> f64| of.iter().map(|trial| f(trial)).sum::<f64>() / of.len() as f64;
+        let present = |f: &dyn Fn(&ExperimentRow) -> Option<f64>| {
             of.iter().map(|trial| f(trial)).sum::<Option<f64>>().map(|sum| sum / of.len() as f64)
         };
         let low = of.iter().map(|trial| trial.autonomy_percent).fold(f64::INFINITY, f64::min);

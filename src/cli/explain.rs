@@ -1,7 +1,6 @@
 //! `steersman explain`: what a model looks at.
 
 use std::path::PathBuf;
-use std::sync::atomic::Ordering;
 
 use clap::Args;
 use serde::Serialize;
@@ -11,9 +10,10 @@ use super::{new_folder, pool, print, print_json, refuse_existing, stop_on_ctrl_c
 use crate::error::{Error, Result};
 use crate::files::atomic_file;
 use crate::pilot::Pilot;
-use crate::report::counterfactual::{Counterfactuals, examine};
-use crate::report::explanation::{self, Exhibit};
-use crate::report::footage::Footage;
+use crate::report::explain::counterfactual::{Counterfactuals, examine};
+use crate::report::explain::exhibits::{Exhibit, exhibits};
+use crate::report::explain::footage::Footage;
+use crate::report::pages::explanation;
 
 /// Show what a model looks at: saliency, filters, feature maps, and what happens when the picture is changed
 #[derive(Debug, Args)]
@@ -56,14 +56,10 @@ pub fn run(args: ExplainArgs) -> Result<()> {
         None => Footage::of_paths(&args.inputs)?,
     };
     let stop = stop_on_ctrl_c()?;
-    let bar = ShareBar::new("changing pictures");
-    let progress = |share| {
-        bar.set(share);
-        !stop.load(Ordering::Relaxed)
-    };
-    let (found, steering) = pool(args.threads)?.install(|| examine(&pilot, &footage, &progress))?;
+    let mut bar = ShareBar::new("changing pictures", &stop);
+    let (found, steering) = pool(args.threads)?.install(|| examine(&pilot, &footage, &mut bar))?;
     drop(bar);
-    let exhibits = explanation::exhibits(&pilot, &footage, &steering)?;
+    let exhibits = exhibits(&pilot, &footage, &steering)?;
     let title = format!("{} on {}", args.model.display(), what(&args));
     let page = explanation::page(&title, &pilot, &found, &exhibits);
 

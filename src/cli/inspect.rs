@@ -5,11 +5,11 @@ use std::path::PathBuf;
 use clap::Args;
 
 use super::share_bar::ShareBar;
-use super::{RecipeArgs, new_folder, pool, print, print_json, refuse_existing};
+use super::{RecipeArgs, new_folder, pool, print, print_json, refuse_existing, stop_on_ctrl_c};
 use crate::dataset::inspect::inspect;
 use crate::error::Result;
 use crate::files::atomic_file;
-use crate::report::inspection;
+use crate::report::pages::inspection;
 
 /// Say what is in a recording: rows, sessions, labels, pictures, what cannot be used, and what to do about it
 #[derive(Debug, Args)]
@@ -36,11 +36,11 @@ pub struct InspectArgs {
 pub fn run(args: InspectArgs) -> Result<()> {
     let recipe = args.recipe.find()?;
     args.out.as_deref().map_or(Ok(()), refuse_existing)?;
-    let pool = pool(args.threads)?;
+    let (pool, stop) = (pool(args.threads)?, stop_on_ctrl_c()?);
     let mut inspections = Vec::new();
     for path in &args.recordings {
-        let bar = ShareBar::new(format!("looking at {}", path.display()));
-        let inspection = pool.install(|| inspect(path, &|share| bar.set(share)))?;
+        let mut bar = ShareBar::new(format!("looking at {}", path.display()), &stop);
+        let inspection = pool.install(|| inspect(path, &mut bar))?;
         drop(bar);
         if !args.json {
             print(&format!("{}\n", inspection.report))?;

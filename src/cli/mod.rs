@@ -3,6 +3,18 @@
 //! Results go to standard output, everything else to standard error. With `--json` the last line of standard output is one
 //! JSON value. Exit codes: 0 done, 1 error, 2 wrong arguments, 130 interrupted.
 
+/// As that of the standard library, but foreign text reaches no terminal raw (see [`crate::text`]), and whoever reads may stop
+/// before the end, as `head` does. All commands print through this macro, [`eprintln`], [`print`] and [`print_json`].
+macro_rules! println {
+    () => { $crate::cli::print_line(std::io::stdout(), "") };
+    ($($arg:tt)+) => { $crate::cli::print_line(std::io::stdout(), &format!($($arg)+)) };
+}
+
+/// As [`println`], to standard error.
+macro_rules! eprintln {
+    ($($arg:tt)+) => { $crate::cli::print_line(std::io::stderr(), &format!($($arg)+)) };
+}
+
 mod bench;
 mod compare;
 mod drive;
@@ -26,8 +38,6 @@ mod video;
 use std::io::{ErrorKind, Write};
 use std::path::Path;
 use std::process::ExitCode;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use clap::{Args, Parser, Subcommand};
@@ -35,7 +45,9 @@ use serde::Serialize;
 
 use crate::error::{Error, Result};
 use crate::model_file::Model;
+use crate::observer::StopSignal;
 use crate::recipe::Recipe;
+use crate::text::{escaped_json, escaped_lines};
 
 /// Learn to steer a car from its front camera, and drive with what was learned.
 #[derive(Debug, Parser)]
@@ -69,7 +81,11 @@ enum Command {
 /// Runs the command line of this process.
 pub fn main() -> ExitCode {
     let started = Instant::now();
-    let result = match Cli::parse().command {
+    let cli = match Cli::try_parse() {
+        Ok(cli) => cli,
+        Err(error) => return wrong_arguments(&error),
+    };
+    let result = match cli.command {
         Command::Train(args) => train::run(args),
         Command::Record(args) => record::run(args),
         Command::Drive(args) => drive::run(args),
@@ -96,6 +112,16 @@ pub fn main() -> ExitCode {
             ExitCode::FAILURE
         }
     }
+}
+
+/// Prints what clap has to say: help, the version, or what is wrong with the arguments, which may be names of foreign files.
+fn wrong_arguments(error: &clap::Error) -> ExitCode {
+    let text = error.render().to_string();
+    if escaped_lines(&text) == text {
+        error.exit();
+    }
+    eprintln!("{}", text.trim_end());
+    ExitCode::from(2)
 }
 
 /// Which recipe, and what to change in it.
@@ -131,12 +157,12 @@ fn pool(threads: usize) -> Result<rayon::ThreadPool> {
     })
 }
 
-/// A flag that Ctrl-C sets; the second Ctrl-C ends the process at once.
-fn stop_on_ctrl_c() -> Result<Arc<AtomicBool>> {
-    let stop = Arc::new(AtomicBool::new(false));
-    let flag = stop.clone();
+/// A signal that Ctrl-C gives; the second Ctrl-C ends the process at once.
+fn stop_on_ctrl_c() -> Result<StopSignal> {
+    let stop = StopSignal::default();
+    let signal = stop.clone();
     let handler = move || {
-        if flag.swap(true, Ordering::Relaxed) {
+        if signal.request() {
             std::process::exit(130);
         }
     };
@@ -158,9 +184,15 @@ fn new_folder(path: &Path) -> Result<()> {
     std::fs::create_dir_all(path).map_err(Error::io(path))
 }
 
+/// Prints a line to `out`, as [`println`] does.
+fn print_line(mut out: impl Write, text: &str) {
+    // A stream that is closed takes no complaint either.
+    let _ = writeln!(out, "{}", escaped_lines(text));
+}
+
 /// Prints `text`. Whoever reads may stop before the end, as `head` does.
 fn print(text: &str) -> Result<()> {
-    match std::io::stdout().lock().write_all(text.as_bytes()) {
+    match std::io::stdout().lock().write_all(escaped_lines(text).as_bytes()) {
         Err(e) if e.kind() != ErrorKind::BrokenPipe => Err(Error::io("standard output")(e)),
         _ => Ok(()),
     }
@@ -169,7 +201,7 @@ fn print(text: &str) -> Result<()> {
 /// Prints one JSON value as the last line.
 fn print_json(value: &impl Serialize) -> Result<()> {
     let text = serde_json::to_string(value).map_err(|e| Error::Fault(format!("cannot be written as JSON: {e}")))?;
-    print(&(text + "\n"))
+    print(&(escaped_json(&text) + "\n"))
 }
 
 /// A number with `decimals`, or a dash where there is none.

@@ -6,8 +6,12 @@ use std::time::{Duration, Instant};
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::or_dash;
-use crate::report::sparkline::sparkline;
-use crate::training::{EpochRecord, Observer};
+use super::share_bar::ShareBar;
+use crate::error::Result;
+use crate::main_job::job::JobEvent;
+use crate::observer::{Observer, StopSignal};
+use crate::report::charts::sparkline::sparkline;
+use crate::training::{EpochRecord, TrainingEvent};
 
 /// Time between plain progress lines.
 const PLAIN_INTERVAL: Duration = Duration::from_secs(10);
@@ -16,8 +20,8 @@ const CURVE_INTERVAL: Duration = Duration::from_millis(200);
 /// Characters of a curve.
 const CURVE: usize = 30;
 
-/// Prints to standard error.
-pub struct Progress {
+/// Shows a training run on standard error.
+pub struct TrainingDisplay {
     bar: Option<ProgressBar>,
     epoch: u32,
     epoch_started: Instant,
@@ -27,18 +31,16 @@ pub struct Progress {
     batch_losses: Vec<f64>,
     /// Of the epochs that are done: training and validation loss.
     losses: [Vec<f64>; 2],
-    /// Whether the run is to measure where its time goes.
-    profile: bool,
 }
 
-impl Progress {
+impl TrainingDisplay {
     /// For a run that is about to begin.
-    pub fn new() -> Progress {
+    pub fn new() -> TrainingDisplay {
         let style = "epoch {prefix} [{bar:30}] {pos}/{len} images, {eta} left, {msg}";
         let style = ProgressStyle::with_template(style).expect("the template is valid").progress_chars("=> ");
         let bar = std::io::stderr().is_terminal().then(|| ProgressBar::new(0).with_style(style));
         let now = Instant::now();
-        Progress {
+        TrainingDisplay {
             bar,
             epoch: 0,
             epoch_started: now,
@@ -46,13 +48,7 @@ impl Progress {
             last_line: now,
             batch_losses: Vec::new(),
             losses: Default::default(),
-            profile: false,
         }
-    }
-
-    /// The same, for a run that measures where its time goes if `profile` says so.
-    pub fn with_profile(self, profile: bool) -> Progress {
-        Progress { profile, ..self }
     }
 
     fn print(&self, text: &str) {
@@ -75,16 +71,19 @@ impl Progress {
     }
 }
 
-impl Observer for Progress {
-    fn notice(&mut self, text: &str) {
-        self.print(text);
+impl Observer<TrainingEvent> for TrainingDisplay {
+    fn observe(&mut self, event: TrainingEvent) -> Result<()> {
+        match event {
+            TrainingEvent::Notice(text) => self.print(&text),
+            TrainingEvent::Batch { epoch, images, of, loss } => self.batch(epoch, images, of, loss),
+            TrainingEvent::Epoch { record, of } => self.epoch(&record, of),
+        }
+        Ok(())
     }
+}
 
-    fn wants_profile(&self) -> bool {
-        self.profile
-    }
-
-    fn progress(&mut self, epoch: u32, images: usize, of: usize, loss: f64) {
+impl TrainingDisplay {
+    fn batch(&mut self, epoch: u32, images: usize, of: usize, loss: f64) {
         if epoch != self.epoch {
             (self.epoch, self.epoch_started, self.images_before) = (epoch, Instant::now(), images);
             self.batch_losses.clear();
@@ -141,5 +140,32 @@ impl Observer for Progress {
         {
             bar.finish_and_clear();
         }
+    }
+}
+
+/// Shows a main job on standard error: its training runs, and a bar for each of its other parts.
+pub struct JobDisplay {
+    training: TrainingDisplay,
+    bar: Option<ShareBar>,
+    stop: StopSignal,
+}
+
+impl JobDisplay {
+    /// For a job that is about to begin, which `stop` ends.
+    pub fn new(stop: &StopSignal) -> JobDisplay {
+        JobDisplay { training: TrainingDisplay::new(), bar: None, stop: stop.clone() }
+    }
+}
+
+impl Observer<JobEvent> for JobDisplay {
+    fn observe(&mut self, event: JobEvent) -> Result<()> {
+        match event {
+            JobEvent::Notice(text) => eprintln!("{text}"),
+            JobEvent::Begin { what } => self.bar = Some(ShareBar::new(what, &self.stop)),
+            JobEvent::Progress(progress) => self.bar.iter_mut().try_for_each(|bar| bar.observe(progress))?,
+            JobEvent::End => self.bar = None,
+            JobEvent::Training(event) => self.training.observe(event)?,
+        }
+        Ok(())
     }
 }

@@ -1,7 +1,6 @@
 //! `steersman record`: the expert drives, or a person, and the cameras watch.
 
 use std::path::{Path, PathBuf};
-use std::sync::atomic::Ordering;
 
 use clap::{Args, ValueEnum};
 
@@ -11,7 +10,7 @@ use crate::error::Result;
 use crate::live::coverage::Shares;
 use crate::live::{DEFAULT_PORT, ManualDrive};
 use crate::simulator::car::expert::Style;
-use crate::simulator::recorder::record::{RECORD_HZ, RecordingInfo};
+use crate::simulator::recorder::options::{RECORD_HZ, RecordingInfo};
 use crate::simulator::{LogFormat, RecordOptions, Track, record};
 
 /// Record the expert driver in the simulator, or with --manual your own driving, in the format of Udacity's simulator
@@ -103,12 +102,8 @@ pub fn run(args: RecordArgs) -> Result<()> {
         return drive_by_hand(&args, &track, &options);
     }
     let stop = stop_on_ctrl_c()?;
-    let bar = ShareBar::new(format!("recording {}", track.name()));
-    let progress = |share| {
-        bar.set(share);
-        !stop.load(Ordering::Relaxed)
-    };
-    let info = pool(args.threads)?.install(|| record(&track, &options, &args.out, &progress))?;
+    let mut bar = ShareBar::new(format!("recording {}", track.name()), &stop);
+    let info = pool(args.threads)?.install(|| record(&track, &options, &args.out, &mut bar))?;
     drop(bar);
     if args.json {
         return print_json(&info);

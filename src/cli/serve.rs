@@ -1,9 +1,8 @@
 //! `steersman serve`: drives Udacity's simulator, or any client that speaks its protocol.
 
-use std::io::{IsTerminal, Write as _};
+use std::io::IsTerminal;
 use std::net::{IpAddr, SocketAddr};
 use std::path::PathBuf;
-use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
 use clap::Args;
@@ -11,8 +10,11 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use super::{or_dash, print_json, stop_on_ctrl_c};
 use crate::error::{Error, Result};
+use crate::observer::Observer;
 use crate::pilot::Pilot;
-use crate::serve::{Console, HelmOptions, Server, ServerOptions, Summary, protocol};
+use crate::serve::{HelmOptions, ServeEvent, Server, ServerOptions, Summary};
+use crate::text::escaped;
+use crate::udacity;
 
 /// Drive Udacity's simulator with a model; it connects by itself in autonomous mode
 #[derive(Debug, Args)]
@@ -29,7 +31,7 @@ pub struct ServeArgs {
     #[arg(long, default_value_t = 0.0, value_name = "MS")]
     smooth: f64,
     /// Port to listen at; the simulator connects to 4567. 0 takes any free one
-    #[arg(long, default_value_t = protocol::DEFAULT_PORT)]
+    #[arg(long, default_value_t = udacity::DEFAULT_PORT)]
     port: u16,
     /// Address to listen at; 0.0.0.0 lets other machines connect
     #[arg(long, default_value = "127.0.0.1", value_name = "ADDRESS")]
@@ -70,14 +72,14 @@ pub fn run(args: ServeArgs) -> Result<()> {
     let stop = stop_on_ctrl_c()?;
     let address = server.address()?;
     say(&format!("listening on ws://{address}/socket.io/"));
-    if args.port != 0 && args.port != protocol::DEFAULT_PORT {
-        say(&format!("note: Udacity's simulator connects to port {} by itself", protocol::DEFAULT_PORT));
+    if args.port != 0 && args.port != udacity::DEFAULT_PORT {
+        say(&format!("note: Udacity's simulator connects to port {} by itself", udacity::DEFAULT_PORT));
     }
     if !args.host.is_loopback() {
         say(&format!("note: whoever reaches {address} can connect; there is no password"));
     }
-    let screen = Screen::new();
-    let summary = server.run(pilot, &screen, &stop)?;
+    let mut screen = Screen::new();
+    let summary = server.run(pilot, &mut screen, &stop)?;
     screen.close();
     if args.json {
         return print_json(&summary);
@@ -111,13 +113,13 @@ fn print_summary(summary: &Summary) {
 
 /// Writes a line to standard error. Whoever reads it may have left, as in `2>&1 | head`; the car is driven on.
 fn say(text: &str) {
-    let _ = writeln!(std::io::stderr(), "{text}");
+    eprintln!("{text}");
 }
 
 /// Standard error: on a terminal the status stays in the last line, elsewhere it is written now and then.
 struct Screen {
     bar: Option<ProgressBar>,
-    last_plain: Mutex<Option<Instant>>,
+    last_plain: Option<Instant>,
 }
 
 impl Screen {
@@ -127,7 +129,7 @@ impl Screen {
     fn new() -> Screen {
         let style = ProgressStyle::with_template("{msg}").expect("the template is valid");
         let bar = std::io::stderr().is_terminal().then(|| ProgressBar::new_spinner().with_style(style));
-        Screen { bar, last_plain: Mutex::new(None) }
+        Screen { bar, last_plain: None }
     }
 
     fn close(&self) {
@@ -137,7 +139,17 @@ impl Screen {
     }
 }
 
-impl Console for Screen {
+impl Observer<ServeEvent> for Screen {
+    fn observe(&mut self, event: ServeEvent) -> Result<()> {
+        match event {
+            ServeEvent::Line(text) => self.line(&text),
+            ServeEvent::Status(text) => self.status(&text),
+        }
+        Ok(())
+    }
+}
+
+impl Screen {
     fn line(&self, text: &str) {
         match &self.bar {
             Some(bar) => bar.suspend(|| say(text)),
@@ -145,16 +157,14 @@ impl Console for Screen {
         }
     }
 
-    fn status(&self, text: &str) {
+    fn status(&mut self, text: &str) {
         if let Some(bar) = &self.bar {
-            bar.set_message(text.to_owned());
+            bar.set_message(escaped(text).into_owned());
             bar.tick();
             return;
         }
-        // A thread that panicked while printing is no reason to lose the line.
-        let mut last = self.last_plain.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
-        if last.is_none_or(|last| last.elapsed() >= Self::PLAIN_INTERVAL) {
-            *last = Some(Instant::now());
+        if self.last_plain.is_none_or(|last| last.elapsed() >= Self::PLAIN_INTERVAL) {
+            self.last_plain = Some(Instant::now());
             say(text);
         }
     }

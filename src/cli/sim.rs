@@ -1,8 +1,6 @@
 //! `steersman sim`: the built-in simulator as the client of a driving server.
 
 use std::path::PathBuf;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 
 use clap::Args;
 use serde::Serialize;
@@ -12,12 +10,13 @@ use super::{or_dash, print_json, stop_on_ctrl_c};
 use crate::error::{Error, Result};
 use crate::files::atomic_file;
 use crate::files::new_folder::create_now;
-use crate::serve::client::{ClientOptions, ClientReport, Numbers, Observer, Pace, ServerUrl, drive};
-use crate::serve::protocol::DecimalMark;
+use crate::observer::Observer;
 use crate::simulator::Track;
-use crate::simulator::trial::run::{Failure, line_errors_m};
-use crate::simulator::trial::statistics::quantile;
+use crate::simulator::trial::outcome::{Failure, line_errors_m};
 use crate::simulator::trial::trajectory::trajectory_csv;
+use crate::simulator_client::{ClientEvent, ClientOptions, ClientReport, ServerUrl, TimeMode, drive};
+use crate::statistics::quantile;
+use crate::udacity::{DecimalMark, NumberStyle};
 
 /// Put the built-in simulator in the place of Udacity's: it connects to a driving server, as `serve` is one
 #[derive(Debug, Args)]
@@ -186,20 +185,27 @@ pub fn run(args: SimArgs) -> Result<()> {
         laps: args.laps,
         seed: args.seed,
         start_mph: args.start_mph,
-        pace: if args.lockstep { Pace::Lockstep } else { Pace::RealTime { fps: args.fps } },
+        time_mode: if args.lockstep { TimeMode::Lockstep } else { TimeMode::RealTime { fps: args.fps } },
         numbers: match (args.term2, args.decimal_comma) {
-            (true, _) => Numbers::Json,
-            (_, true) => Numbers::Strings(DecimalMark::COMMA),
-            _ => Numbers::Strings(DecimalMark::DOT),
+            (true, _) => NumberStyle::Json,
+            (_, true) => NumberStyle::Strings(DecimalMark::COMMA),
+            _ => NumberStyle::Strings(DecimalMark::DOT),
         },
         manual_s: args.manual,
         scene_change_s: args.scene_change,
         frames: args.frames,
         patience_s: args.patience,
     };
-    let mut progress = Progress { bar: ShareBar::new(format!("driving {}", track.name())), stop: stop_on_ctrl_c()? };
-    let report = drive(&track, &options, &mut progress)?;
-    drop(progress);
+    let mut bar = ShareBar::new(format!("driving {}", track.name()), &stop_on_ctrl_c()?);
+    let mut observer = |event| match event {
+        ClientEvent::Notice(text) => {
+            bar.print(&text);
+            Ok(())
+        }
+        ClientEvent::Progress(progress) => bar.observe(progress),
+    };
+    let report = drive(&track, &options, &mut observer)?;
+    drop(bar);
     if let Some(out) = &args.out {
         create_now(out)?;
         atomic_file::write(&out.join(format!("free_{}.csv", args.seed)), trajectory_csv(&report.run).as_bytes())?;
@@ -216,20 +222,4 @@ pub fn run(args: SimArgs) -> Result<()> {
 fn interval(text: &str) -> Result<(f64, f64), String> {
     let parts = text.split_once(':').and_then(|(from, to)| Some((from.parse().ok()?, to.parse().ok()?)));
     parts.ok_or_else(|| "two times in seconds are meant, as in 5:8".into())
-}
-
-struct Progress {
-    bar: ShareBar,
-    stop: Arc<AtomicBool>,
-}
-
-impl Observer for Progress {
-    fn notice(&mut self, text: &str) {
-        self.bar.print(text);
-    }
-
-    fn progress(&mut self, share: f64) -> bool {
-        self.bar.set(share);
-        !self.stop.load(Ordering::Relaxed)
-    }
 }

@@ -12,7 +12,7 @@ use crate::error::Result;
 use crate::files::atomic_file;
 use crate::model_file::Model;
 use crate::recipe::Recipe;
-use crate::report::network_diagram;
+use crate::report::charts::network_diagram;
 
 /// Print the layer table of a recipe or a model, or draw it
 #[derive(Debug, Args)]

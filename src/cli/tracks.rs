@@ -10,10 +10,10 @@ use image::{ImageFormat, RgbImage};
 use serde::Serialize;
 
 use super::{print, print_json};
-use crate::dataset::decode::{self, decode_rgb};
-use crate::dataset::{self, Camera};
+use crate::dataset::{self, View};
 use crate::error::{Error, Result};
 use crate::files::new_folder::NewFolder;
+use crate::picture::{self, decode::decode_rgb};
 use crate::simulator::camera::contact_sheet::contact_sheet;
 use crate::simulator::road::builtin;
 use crate::simulator::{Track, side_by_side};
@@ -147,12 +147,12 @@ fn save(sheet: &RgbImage, path: &Path) -> Result<()> {
 fn pictures(path: &Path, most: usize) -> Result<Vec<RgbImage>> {
     let recording = dataset::load(path)?;
     let rows: Vec<PathBuf> =
-        (0..recording.rows.len()).filter_map(|row| recording.image_path(row, Camera::Centre)).collect();
+        (0..recording.rows.len()).filter_map(|row| recording.image_path(row, View::Centre)).collect();
     if rows.is_empty() {
         return Err(Error::data(path, "no row has a picture of the centre camera; name another recording"));
     }
     let n = most.min(rows.len());
-    let mut decoded = decode::RgbImage::default();
+    let mut decoded = picture::RgbImage::default();
     (0..n)
         .map(|k| {
             let path = &rows[k * rows.len() / n];

@@ -4,9 +4,9 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use clap::Args;
+use steersman_kernels::conv::ConvAlgorithm;
 
-use super::progress::Progress;
-use super::share_bar::Bars;
+use super::progress::{JobDisplay, TrainingDisplay};
 use super::{RecipeArgs, or_dash, pool, print_json, stop_on_ctrl_c};
 use crate::dataset::held_out::{self, trained_on_held_out};
 use crate::error::{Error, Result};
@@ -39,11 +39,14 @@ pub struct TrainArgs {
     /// Threads; 0 is one for each core
     #[arg(long, default_value_t = 0)]
     threads: usize,
+    /// How convolutions are computed: auto (the fastest for each shape) or im2col (the textbook way) [default: auto]
+    #[arg(long, value_name = "NAME")]
+    algorithm: Option<ConvAlgorithm>,
     /// Memory for decoded images, in MiB; what does not fit goes to a temporary file
     #[arg(long, default_value_t = 1024, value_name = "MIB")]
     cache: usize,
     /// Go on with a run that was stopped, as if it had never stopped
-    #[arg(long, value_name = "RUN", conflicts_with_all = ["recordings", "recipe", "overrides", "out", "seed", "cache"])]
+    #[arg(long, value_name = "RUN", conflicts_with_all = ["recordings", "recipe", "overrides", "out", "seed", "cache", "algorithm"])]
     resume: Option<PathBuf>,
     /// Without a recording: runs of the finished model on each track, of one lap
     #[arg(long, default_value_t = 1, conflicts_with_all = ["recordings", "resume"])]
@@ -71,7 +74,6 @@ pub fn run(args: TrainArgs) -> Result<()> {
     }
     let stop = stop_on_ctrl_c()?;
     let pool = pool(args.threads)?;
-    let mut progress = Progress::new().with_profile(args.profile);
     let from = args.from.map(|model| TransferRequest { model, freeze: args.freeze });
     let recipe = || match &from {
         Some(from) => args.recipe.find_or_of(&from.model),
@@ -83,14 +85,15 @@ pub fn run(args: TrainArgs) -> Result<()> {
         None => None,
     };
     if let Some(note) = note {
-        let bars = Bars;
-        let mut job = Job::new(Scope::default(), note, &mut progress, &bars, &stop);
+        let mut display = JobDisplay::new(&stop);
+        let mut job = Job::new(Scope::default(), note, &mut display, &stop).with_profile(args.profile);
         let result = match args.resume {
             Some(folder) => pool.install(|| job.go_on(&folder)),
             None => {
                 let recipe = recipe()?;
                 let out = args.out.unwrap_or_else(|| RunFolder::next_free(&recipe.name));
-                let request = JobRequest { recipe, out, seed: args.seed, cache_mib: args.cache, from };
+                let (seed, cache_mib, algorithm) = (args.seed, args.cache, args.algorithm);
+                let request = JobRequest { recipe, out, seed, cache_mib, from, algorithm };
                 pool.install(|| job.begin(request))
             }
         };
@@ -111,9 +114,10 @@ pub fn run(args: TrainArgs) -> Result<()> {
         );
         return Ok(());
     }
+    let mut display = TrainingDisplay::new();
     let (folder, result) = match args.resume {
         Some(folder) => {
-            let result = pool.install(|| training::resume(&folder, &mut progress, &stop));
+            let result = pool.install(|| training::resume(&folder, args.profile, &mut display, &stop));
             (folder, result)
         }
         None => {
@@ -130,8 +134,10 @@ pub fn run(args: TrainArgs) -> Result<()> {
                 seed: args.seed,
                 cache_mib: args.cache,
                 from,
+                profile: args.profile,
+                algorithm: args.algorithm,
             };
-            let result = pool.install(|| training::train(request, &mut progress, &stop));
+            let result = pool.install(|| training::train(request, &mut display, &stop));
             (out, result)
         }
     };
@@ -146,7 +152,7 @@ pub fn run(args: TrainArgs) -> Result<()> {
 
 /// Writes the page of the finished run in `folder`. The run is saved; a page that cannot be written takes nothing from it.
 fn write_report(folder: &Path) {
-    match report::run::write(folder) {
+    match report::pages::run::write(folder) {
         Ok(page) => eprintln!("report {}", page.display()),
         Err(error) => eprintln!("note: no report.html: {error}"),
     }

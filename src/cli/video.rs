@@ -1,7 +1,6 @@
 //! `steersman video`: recordings and drives as video files.
 
 use std::path::{Path, PathBuf};
-use std::sync::atomic::Ordering;
 
 use clap::Args;
 use serde::Serialize;
@@ -10,8 +9,10 @@ use super::share_bar::ShareBar;
 use super::{print_json, stop_on_ctrl_c};
 use crate::error::{Error, Result};
 use crate::pilot::Pilot;
-use crate::report::video::replay::{self, Choice};
-use crate::report::video::{Onlooker, VideoSummary, recording};
+use crate::report::video::onlooker::Onlooker;
+use crate::report::video::recording;
+use crate::report::video::replay::{self, RunChoice};
+use crate::report::video::summary::VideoSummary;
 use crate::simulator::trial::trajectory::{RUN_DEPTH, find_drives, is_drive};
 
 /// Write a recording or a saved drive as a video that browsers and VLC play
@@ -66,16 +67,12 @@ pub fn run(args: VideoArgs) -> Result<()> {
         return Err(Error::Usage(format!("{} {message}", args.source.display())));
     }
     let stop = stop_on_ctrl_c()?;
-    let bar = ShareBar::new("filming");
-    let mut progress = |share| {
-        bar.set(share);
-        !stop.load(Ordering::Relaxed)
-    };
+    let mut bar = ShareBar::new("filming", &stop);
     let (summary, stopped) = if is_drive {
-        let choice = Choice { seed: args.seed, assisted: args.assisted };
-        replay::film(&args.source, choice, &args.file, onlooker, args.fps, &mut progress)?
+        let choice = RunChoice { seed: args.seed, assisted: args.assisted };
+        replay::film(&args.source, choice, &args.file, onlooker, args.fps, &mut bar)?
     } else {
-        recording::film(&args.source, &args.file, onlooker, args.fps, &mut progress)?
+        recording::film(&args.source, &args.file, onlooker, args.fps, &mut bar)?
     };
     drop(bar);
     if args.json {

@@ -1,10 +1,10 @@
 //! Finding out what a recording is, and reading it.
 
-use super::decode;
-use super::driving_log::{Entry, Line, Log, time_of};
-use super::files::{Files, Locator, split_path};
-use super::recording::{Camera, Kind, Reason, Recording, Row, Unusable, file_name};
-use super::tub::Tub;
+use super::formats::tub::Tub;
+use super::formats::udacity::{Entry, Line, Log, time_of};
+use super::pictures::files::{Files, Locator, split_path};
+use super::recording::{Kind, Recording, Row, View, file_name};
+use super::unusable::{Reason, Unusable};
 use crate::{Error, Result};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
@@ -245,9 +245,9 @@ impl Builder {
         };
         recording.settle(log);
         recording.image_size = recording
-            .image_path(0, Camera::Centre)
+            .image_path(0, View::Centre)
             .and_then(|path| fs::read(path).ok())
-            .and_then(|bytes| decode::image_size(&bytes).ok());
+            .and_then(|bytes| crate::picture::decode::image_size(&bytes).ok());
         Ok(recording)
     }
 }

@@ -44,8 +44,8 @@ fn images_are_found_wherever_they_were_recorded() {
     log(folder.path(), &text);
     let recording = load(folder.path()).unwrap();
     assert_eq!(recording.rows.len(), written.len(), "{:?}", recording.unusable);
-    assert_eq!(recording.image_path(0, Camera::Left), Some(folder.path().join("IMG").join("a.jpg")));
-    assert_eq!(recording.image_path(6, Camera::Right), Some(elsewhere.path().join("d.jpg")));
+    assert_eq!(recording.image_path(0, View::Left), Some(folder.path().join("IMG").join("a.jpg")));
+    assert_eq!(recording.image_path(6, View::Right), Some(elsewhere.path().join("d.jpg")));
     assert_eq!(recording.image_size, Some([8, 8]));
 }
 
@@ -92,7 +92,7 @@ fn a_camera_without_any_image_falls_away() {
     }
     let recording = load(folder.path()).unwrap();
     assert_eq!((recording.rows.len(), recording.unusable.rows()), (12, 0));
-    assert!(recording.has(Camera::Right) && !recording.has(Camera::Left));
+    assert!(recording.has(View::Right) && !recording.has(View::Left));
     assert!(recording.notices[0].contains("left camera"), "{:?}", recording.notices);
     assert!(recording.require_usable().is_ok());
 }
@@ -190,7 +190,7 @@ fn the_real_recordings_have_the_counts_of_their_readme() {
         assert_eq!((recording.total_rows(), recording.rows.len()), (total, usable), "{name}");
         assert_eq!(Some(recording.sessions.len()), sessions, "{name} {:?}", recording.sessions);
         assert!(recording.require_usable().is_ok());
-        let cameras = Camera::ALL.into_iter().filter(|&camera| recording.has(camera)).count();
+        let cameras = View::ALL.into_iter().filter(|&camera| recording.has(camera)).count();
         assert_eq!(cameras, if name == "donkey-tub" { 1 } else { 3 });
         assert_eq!(recording.times_plausible, name != "donkey-tub");
     }

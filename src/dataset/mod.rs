@@ -10,28 +10,21 @@
 //! clamped. [`leak`] measures what the training side gives away of the validation side, [`inspect`] describes a
 //! recording for people.
 
-pub mod augment;
-pub mod cache;
-pub mod colour;
-mod decimal_comma;
-pub mod decode;
-mod driving_log;
-mod files;
+mod formats;
 pub mod held_out;
 pub mod inspect;
-pub mod leak;
 mod load;
-pub mod loader;
-pub mod preprocess;
+mod pictures;
 mod recording;
-pub mod resize;
 mod samples;
-pub mod split;
-mod tub;
+mod unusable;
 
+pub use formats::udacity_writer;
 pub use load::{ImageCheck, load, load_with};
-pub use recording::{ASSUMED_STEP_MS, Camera, Kind, Reason, Recording, Row, SESSION_GAP_MS, Tally, Unusable};
-pub use samples::{Balance, Flip, Group, Item, SampleSpec};
+pub use pictures::{cache, colour, preprocess, resize};
+pub use recording::{ASSUMED_STEP_MS, Kind, Recording, Row, SESSION_GAP_MS, View};
+pub use samples::{Balance, Flip, Group, Item, SampleSpec, augment, leak, loader, split};
+pub use unusable::{Reason, Tally, Unusable};
 
 #[cfg(test)]
 pub(crate) mod testing;

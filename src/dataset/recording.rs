@@ -1,11 +1,13 @@
 //! What is known of a recording once it is read: rows, sessions, and what had to be left out.
 
-use super::files::{Files, Name};
-use super::preprocess::Preprocessing;
+use super::pictures::files::{Files, Name};
+use super::pictures::preprocess::Preprocessing;
+use super::unusable::{Reason, Unusable};
+use crate::picture::RgbImage;
+use crate::picture::decode::decode_rgb;
 use crate::{Error, Result};
 use serde::Serialize;
 use sha2::{Digest, Sha256};
-use std::collections::BTreeMap;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
@@ -15,9 +17,6 @@ pub const SESSION_GAP_MS: i64 = 1000;
 pub const ASSUMED_STEP_MS: i64 = 50;
 /// Largest share of unusable rows that training accepts.
 const MAX_UNUSABLE_SHARE: f64 = 0.2;
-/// Examples kept for each reason.
-const EXAMPLES: usize = 3;
-
 /// Who wrote a recording.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
@@ -28,10 +27,10 @@ pub enum Kind {
     Tub,
 }
 
-/// A camera of the car.
+/// Which camera of the car a picture is from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "kebab-case")]
-pub enum Camera {
+pub enum View {
     /// In the middle, the one that drives.
     Centre,
     /// About 0.8 m to the left.
@@ -40,9 +39,9 @@ pub enum Camera {
     Right,
 }
 
-impl Camera {
+impl View {
     /// All cameras, in the order of the columns of a log.
-    pub const ALL: [Camera; 3] = [Camera::Centre, Camera::Left, Camera::Right];
+    pub const ALL: [View; 3] = [View::Centre, View::Left, View::Right];
 
     /// Name in messages.
     pub fn name(self) -> &'static str {
@@ -77,73 +76,6 @@ pub struct Row {
     pub(super) side_faults: [Option<Reason>; 2],
 }
 
-/// Why a row cannot be used.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Reason {
-    /// Fewer fields than a row has.
-    TooFewFields,
-    /// More fields than a row has, and decimal commas do not explain them.
-    TooManyFields,
-    /// Decimal commas that can be read in more than one way.
-    Ambiguous,
-    /// A field that should be a number is none, or a record is not readable.
-    NotANumber,
-    /// The steering label is not in [-1, 1], or not finite.
-    LabelOutOfRange,
-    /// An image file is not there.
-    ImageMissing,
-    /// An image file is empty or ends too early.
-    ImageTruncated,
-    /// An image file is neither JPEG nor PNG, or cannot be read.
-    NotAnImage,
-}
-
-impl Reason {
-    /// The reason in words.
-    pub fn text(self) -> &'static str {
-        match self {
-            Reason::TooFewFields => "too few fields",
-            Reason::TooManyFields => "too many fields",
-            Reason::Ambiguous => "decimal commas that can be read in more than one way",
-            Reason::NotANumber => "not a number",
-            Reason::LabelOutOfRange => "label out of range or not finite",
-            Reason::ImageMissing => "image missing",
-            Reason::ImageTruncated => "image truncated",
-            Reason::NotAnImage => "not a readable image",
-        }
-    }
-}
-
-/// Rows left out for one reason.
-#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
-pub struct Tally {
-    /// Number of rows.
-    pub rows: usize,
-    /// The first few, each with its place.
-    pub examples: Vec<String>,
-}
-
-/// The rows that had to be left out, by reason.
-#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
-pub struct Unusable(pub BTreeMap<Reason, Tally>);
-
-impl Unusable {
-    /// Number of rows left out.
-    pub fn rows(&self) -> usize {
-        self.0.values().map(|tally| tally.rows).sum()
-    }
-
-    /// Counts a row; the first few of each reason are kept as examples.
-    pub(super) fn add(&mut self, reason: Reason, example: impl FnOnce() -> String) {
-        let tally = self.0.entry(reason).or_default();
-        tally.rows += 1;
-        if tally.examples.len() < EXAMPLES {
-            tally.examples.push(example());
-        }
-    }
-}
-
 /// A recording, ready to be split and loaded. Its files are only ever read.
 #[derive(Debug)]
 pub struct Recording {
@@ -173,14 +105,22 @@ impl Recording {
     }
 
     /// Whether the recording has images of `camera`.
-    pub fn has(&self, camera: Camera) -> bool {
+    pub fn has(&self, camera: View) -> bool {
         self.rows.iter().any(|row| row.images[camera as usize].is_some())
     }
 
     /// Path of the image of `camera` at `row`, if there is one.
-    pub fn image_path(&self, row: usize, camera: Camera) -> Option<PathBuf> {
+    pub fn image_path(&self, row: usize, camera: View) -> Option<PathBuf> {
         let name = self.rows.get(row)?.images[camera as usize]?;
         Some(self.files.path(name))
+    }
+
+    /// The picture of `camera` at `row`, if there is one that can be read and decoded.
+    pub fn picture(&self, row: usize, camera: View) -> Option<RgbImage> {
+        let bytes = std::fs::read(self.image_path(row, camera)?).ok()?;
+        let mut image = RgbImage::default();
+        decode_rgb(&bytes, &mut image).ok()?;
+        Some(image)
     }
 
     /// A number that stands for `row` wherever the recording lies: from the name of its centre image and its steering. Model
@@ -189,7 +129,7 @@ impl Recording {
     /// # Panics
     /// If there is no such row.
     pub fn row_id(&self, row: usize) -> u64 {
-        let path = self.image_path(row, Camera::Centre);
+        let path = self.image_path(row, View::Centre);
         let name = path.as_ref().and_then(|path| path.file_name()).unwrap_or_default();
         let mut hash = Sha256::new();
         hash.update(name.as_encoded_bytes());
@@ -199,7 +139,7 @@ impl Recording {
     }
 
     /// Whether `row` has an image of `camera`.
-    pub fn row_has(&self, row: usize, camera: Camera) -> bool {
+    pub fn row_has(&self, row: usize, camera: View) -> bool {
         self.rows.get(row).is_some_and(|row| row.images[camera as usize].is_some())
     }
 
@@ -284,7 +224,7 @@ impl Recording {
             let named = self.rows.iter().any(|row| row.side_faults[side].is_some());
             *fallen = named && !self.rows.iter().any(|row| row.images[side + 1].is_some());
             if *fallen {
-                let camera = Camera::ALL[side + 1].name();
+                let camera = View::ALL[side + 1].name();
                 self.notices.push(format!("no image of the {camera} camera can be read; the camera falls away"));
             }
         }
@@ -292,7 +232,7 @@ impl Recording {
         rows.retain(|row| {
             let fault = (0..2).filter(|&side| !fallen[side]).find_map(|side| Some((side, row.side_faults[side]?)));
             if let Some((side, reason)) = fault {
-                let camera = Camera::ALL[side + 1].name();
+                let camera = View::ALL[side + 1].name();
                 unusable.add(reason, || format!("{log}:{}: {camera} image", row.line));
             }
             fault.is_none()
@@ -368,6 +308,6 @@ mod tests {
     #[test]
     fn side_cameras_correct_towards_the_middle() {
         // The left camera sees what a car too far left would see: it has to steer right, which is positive.
-        assert_eq!(Camera::ALL.map(Camera::correction_sign), [0.0, 1.0, -1.0]);
+        assert_eq!(View::ALL.map(View::correction_sign), [0.0, 1.0, -1.0]);
     }
 }

@@ -1,7 +1,8 @@
 //! What the tests of this module share.
 
-use super::files::Files;
-use super::recording::{Camera, Kind, Recording, Row, Unusable};
+use super::pictures::files::Files;
+use super::recording::{Kind, Recording, Row, View};
+use crate::dataset::unusable::Unusable;
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -36,7 +37,7 @@ pub(crate) fn recordings_folder() -> Option<PathBuf> {
 /// A recording without files: one session, a row every `step_ms`, all three cameras.
 pub(crate) fn recording_of(steering: &[f32], step_ms: i64) -> Recording {
     let mut files = Files::default();
-    let images = Camera::ALL.map(|camera| Some((Path::new("IMG"), camera.name())));
+    let images = View::ALL.map(|camera| Some((Path::new("IMG"), camera.name())));
     let images = files.add(images).expect("three short names fit");
     let rows = steering.iter().enumerate().map(|(i, &steering)| Row {
         steering,

@@ -10,14 +10,14 @@ use std::path::Path;
 use rayon::prelude::*;
 
 use crate::dataset::colour::Colour;
-use crate::dataset::decode::{RgbImage, decode_rgb};
 use crate::dataset::preprocess::Preprocessing;
 use crate::dataset::resize::Interpolation;
-use crate::dataset::{Camera, Recording};
+use crate::dataset::{Recording, View};
 use crate::engine::network::{InferencePlan, LayerSpec, Network, Parameters};
 use crate::engine::tensor::Shape;
 use crate::error::{Error, Result};
-use crate::report::correlation;
+use crate::metrics::correlation;
+use crate::picture::{RgbImage, decode::decode_rgb};
 
 /// Kept rows of Udacity's picture, in projects of the field.
 const CROPS: [[usize; 2]; 12] = [
@@ -76,14 +76,14 @@ impl Frames {
     ///
     /// [`Error::Data`] if no frame can be read or all labels are the same.
     pub fn of(recording: &Recording) -> Result<Frames> {
-        let rows = || (0..recording.rows.len()).filter(|row| recording.row_has(*row, Camera::Centre));
+        let rows = || (0..recording.rows.len()).filter(|row| recording.row_has(*row, View::Centre));
         let is_turned = |row: &usize| recording.rows[*row].steering.abs() >= TURNED;
         let turned = spread(rows().filter(is_turned).collect(), FRAMES[1] * 2 / 3);
         let straight = spread(rows().filter(|row| !is_turned(row)).collect(), FRAMES[1] - FRAMES[1] * 2 / 3);
         let mut chosen = [turned, straight].concat();
         chosen.sort_unstable();
         let read = |row: usize| -> Option<(RgbImage, f32)> {
-            let bytes = std::fs::read(recording.image_path(row, Camera::Centre)?).ok()?;
+            let bytes = std::fs::read(recording.image_path(row, View::Centre)?).ok()?;
             let mut image = RgbImage::default();
             decode_rgb(&bytes, &mut image).ok()?;
             // All combinations begin by scaling the image to this size; so much of it is kept in memory.

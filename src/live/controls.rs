@@ -1,4 +1,4 @@
-//! The wheel: which connection has it, what it does, and what the car makes of it.
+//! The wheel: which connection holds it, its input, and the controls that follow.
 
 use std::time::{Duration, Instant};
 
@@ -7,22 +7,22 @@ use crate::simulator::car::dynamics::Controls;
 use crate::simulator::car::keys;
 use crate::simulator::car::speed::SpeedController;
 
-/// Who says nothing for so long has let go. (A page that is hidden says that it leaves; a browser that ends closes its
-/// connection. This is for one that hangs.)
+/// A connection that sends nothing for so long loses the wheel. (A page that is hidden says that it leaves, and a browser that
+/// ends closes its connection. This is for a browser that hangs.)
 const SILENCE: Duration = Duration::from_millis(1500);
 
-/// What happens once, when a page asks for it.
+/// Something that a page asks for and that happens once.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Event {
+pub enum Action {
     /// Begin to record, or pause.
     Record,
-    /// Hold the accelerator, or let go.
+    /// Hold the accelerator, or release it.
     Cruise,
-    /// Onto the middle of the road.
+    /// Put the car onto the middle of the road.
     PutBack,
     /// The same, facing the other way.
     TurnRound,
-    /// The end.
+    /// End the drive.
     Finish,
 }
 
@@ -32,14 +32,14 @@ pub struct Wheel {
     holder: Option<u64>,
     input: Input,
     heard: Option<Instant>,
-    events: Vec<Event>,
+    actions: Vec<Action>,
 }
 
 impl Wheel {
-    /// Takes a request of connection `id` at `now`. Who steers or takes it first gets the wheel; what others ask for is ignored as long as it
-    /// is held, but for taking it.
+    /// Handles a request of connection `id` at `now`. The first connection that steers gets the wheel. While it holds the
+    /// wheel, this ignores the requests of others, except that they may take the wheel.
     pub fn take(&mut self, id: u64, request: Request, now: Instant) {
-        let event = match request {
+        let action = match request {
             Request::Next => return,
             Request::Leave => return self.leave(id),
             Request::Take => {
@@ -57,27 +57,27 @@ impl Wheel {
                 }
                 None
             }
-            Request::Record => Some(Event::Record),
-            Request::Cruise => Some(Event::Cruise),
-            Request::PutBack => Some(Event::PutBack),
-            Request::TurnRound => Some(Event::TurnRound),
-            Request::Finish => Some(Event::Finish),
+            Request::Record => Some(Action::Record),
+            Request::Cruise => Some(Action::Cruise),
+            Request::PutBack => Some(Action::PutBack),
+            Request::TurnRound => Some(Action::TurnRound),
+            Request::Finish => Some(Action::Finish),
         };
         if self.holder == Some(id) {
             self.heard = Some(now);
-            self.events.extend(event);
+            self.actions.extend(action);
         }
     }
 
-    /// Connection `id` lets go, or is gone.
+    /// Connection `id` releases the wheel or has ended.
     pub fn leave(&mut self, id: u64) {
         if self.holder == Some(id) {
-            // What was asked for before, an end above all, still happens.
-            *self = Wheel { events: std::mem::take(&mut self.events), ..Wheel::default() };
+            // Earlier requests still happen, above all the end of the drive.
+            *self = Wheel { actions: std::mem::take(&mut self.actions), ..Wheel::default() };
         }
     }
 
-    /// Who has the wheel at `now`.
+    /// The connection that holds the wheel at `now`.
     pub fn holder(&mut self, now: Instant) -> Option<u64> {
         if self.heard.is_none_or(|heard| now.saturating_duration_since(heard) > SILENCE) {
             *self = Wheel::default();
@@ -85,30 +85,29 @@ impl Wheel {
         self.holder
     }
 
-    /// What is pressed at `now`, if somebody has the wheel.
+    /// The input at `now`, if a connection holds the wheel.
     pub fn input(&mut self, now: Instant) -> Option<Input> {
         self.holder(now).map(|_| self.input)
     }
 
-    /// What was asked for since the last time.
-    pub fn take_events(&mut self) -> Vec<Event> {
-        std::mem::take(&mut self.events)
+    /// The actions since the last call.
+    pub fn take_actions(&mut self) -> Vec<Action> {
+        std::mem::take(&mut self.actions)
     }
 }
 
-/// What the car makes of keys, mouse and gamepad, one step of 20 ms after the other.
+/// Turns keys, mouse and gamepad into controls, one step of 20 ms after another.
 #[derive(Clone, Debug, Default)]
 pub struct Cockpit {
     controls: Controls,
-    /// The accelerator is held.
+    /// Whether the accelerator is held.
     pub cruise: bool,
     limiter: SpeedController,
 }
 
 impl Cockpit {
-    /// The controls of the next step at `speed_mph`, of which no more than `most_mph` is wanted. With nobody at the wheel the
-    /// car brakes.
-    pub fn step(&mut self, input: Option<Input>, speed_mph: f64, most_mph: f64, step_s: f64) -> Controls {
+    /// The controls of the next step at `speed_mph`, with `max_mph` as the speed limit. Without input the car brakes.
+    pub fn step(&mut self, input: Option<Input>, speed_mph: f64, max_mph: f64, step_s: f64) -> Controls {
         let Some(input) = input else {
             *self =
                 Cockpit { controls: Controls { steering: self.controls.steering, throttle: -1.0 }, ..Self::default() };
@@ -130,9 +129,9 @@ impl Cockpit {
         if wanted <= 0.0 {
             self.limiter = SpeedController::default();
         }
-        // The foot may want more than the limit; only the brake is the driver's alone.
-        let most = if wanted > 0.0 { self.limiter.throttle(most_mph, speed_mph, step_s).max(0.0) } else { 0.0 };
-        self.controls.throttle = wanted.min(most);
+        // The speed limit holds for the accelerator; the brake is always the driver's.
+        let max = if wanted > 0.0 { self.limiter.throttle(max_mph, speed_mph, step_s).max(0.0) } else { 0.0 };
+        self.controls.throttle = wanted.min(max);
         self.controls
     }
 }
@@ -154,11 +153,11 @@ mod tests {
         wheel.take(2, Request::Controls(pressed(-1.0, 0.0)), at(10));
         wheel.take(2, Request::Finish, at(11));
         assert_eq!((wheel.holder(at(20)), wheel.input(at(20))), (Some(1), Some(pressed(1.0, 0.0))));
-        assert!(wheel.take_events().is_empty(), "who only looks on cannot end the drive");
+        assert!(wheel.take_actions().is_empty(), "who only looks on cannot end the drive");
         wheel.take(2, Request::Take, at(30));
         assert_eq!(wheel.input(at(31)), Some(Input::default()), "keys of another are not pressed any more");
         wheel.take(2, Request::Record, at(40));
-        assert_eq!(wheel.take_events(), [Event::Record]);
+        assert_eq!(wheel.take_actions(), [Action::Record]);
         wheel.leave(1);
         assert_eq!(wheel.holder(at(50)), Some(2));
         assert_eq!(wheel.holder(at(2000)), None, "silence");

@@ -1,20 +1,21 @@
-//! What a recording covers so far, and what it still lacks.
+//! What a recording covers so far, and what it lacks.
 
 use serde::Serialize;
 
 use crate::dataset::inspect::advice::{FEW_ROWS, MANY_ZEROS, MUCH_FULL_LOCK, RARE_SIDE};
 use crate::dataset::inspect::{FULL_LOCK, STRAIGHT};
 
-/// From this distance beside the line on, driving back to it counts as recovery, m: where the expert's recoveries begin.
+/// Smallest distance from the line at which driving back to it counts as a recovery, m. The recoveries of the expert begin
+/// there.
 const RECOVERY_M: f64 = 0.7;
-/// Share of rows that should show a recovery.
-const ENOUGH_RECOVERY: f64 = 0.05;
+/// Smallest share of rows that should show a recovery.
+const MIN_RECOVERY: f64 = 0.05;
 /// Laps after which there should be recoveries.
 const SETTLED_LAPS: f64 = 1.0;
-/// Share of the way that should be driven in each direction.
-const ENOUGH_REVERSE: f64 = 0.2;
+/// Smallest share of the distance that should be driven in each direction.
+const MIN_REVERSE: f64 = 0.2;
 
-/// A row, as far as it counts.
+/// What counts of a row.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Row {
     /// Label, [-1, 1], + = right.
@@ -23,13 +24,13 @@ pub struct Row {
     pub cte_m: f64,
     /// Sine of the angle between car and line, + = the car points to the right of it.
     pub heading_error: f64,
-    /// Driven against the direction of the track's points.
+    /// Whether the car drives against the direction of the track's points.
     pub reverse: bool,
-    /// Way along the line since the row before, m.
+    /// Distance along the line since the row before, m.
     pub way_m: f64,
 }
 
-/// Counts of rows.
+/// Counts over the rows so far.
 #[derive(Clone, Debug, Default)]
 pub struct Coverage {
     rows: usize,
@@ -42,29 +43,29 @@ pub struct Coverage {
     reverse_m: f64,
 }
 
-/// What the page shows.
+/// What the page shows of the counts.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Shares {
     /// Rows recorded.
     pub rows: usize,
-    /// Their time, minutes.
+    /// Duration of the rows, minutes.
     pub minutes: f64,
-    /// Their way, laps.
+    /// Distance of the rows, laps.
     pub laps: f64,
     /// Share of rows that steer left by more than a degree, 0 to 1.
     pub left: f64,
     /// Share of rows that steer right by more than a degree.
     pub right: f64,
-    /// Share of rows that lead back to the line from beside it.
+    /// Share of rows that drive back to the line from beside it.
     pub recovery: f64,
-    /// Share of the way driven against the direction of the track's points.
+    /// Share of the distance driven against the direction of the track's points.
     pub reverse: f64,
 }
 
 impl Coverage {
     /// Counts a row.
     pub fn add(&mut self, row: &Row) {
-        // As the log says it, and as `inspect` will count it.
+        // The precision of the log, so that the counts are those of `inspect`.
         let steering = row.steering as f32;
         self.rows += 1;
         self.left += usize::from(steering < -STRAIGHT);
@@ -82,7 +83,7 @@ impl Coverage {
         of as f64 / self.rows.max(1) as f64
     }
 
-    /// Shares of `hz` rows a second on a lap of `lap_m` metres.
+    /// The shares at `hz` rows per second and a lap of `lap_m` metres.
     pub fn shares(&self, hz: u64, lap_m: f64) -> Shares {
         Shares {
             rows: self.rows,
@@ -95,7 +96,7 @@ impl Coverage {
         }
     }
 
-    /// What to do next, the weightiest first.
+    /// What to do next, the most important first.
     pub fn advice(&self, lap_m: f64) -> Vec<String> {
         if self.rows == 0 {
             return vec!["Press R to record: nothing is recorded yet.".into()];
@@ -121,11 +122,11 @@ impl Coverage {
             advice.push(format!("{share} of the turns are to the {side}: press U and drive the other way round."));
         } else if laps >= 2.0 * SETTLED_LAPS {
             let reverse = self.reverse_m / self.way_m.max(1e-9);
-            if reverse.min(1.0 - reverse) < ENOUGH_REVERSE {
+            if reverse.min(1.0 - reverse) < MIN_REVERSE {
                 advice.push("Press U and drive the other way round, too: it is a new road to the network.".into());
             }
         }
-        if laps >= SETTLED_LAPS && self.share(self.recovery) < ENOUGH_RECOVERY {
+        if laps >= SETTLED_LAPS && self.share(self.recovery) < MIN_RECOVERY {
             advice.push(
                 "Few ways back to the middle: pause with R, drive to the edge, press R again, and steer back.".into(),
             );

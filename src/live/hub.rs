@@ -1,4 +1,4 @@
-//! What the drive and the connections share.
+//! What the drive and the connections share: the newest frame, the trail, and the wheel.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
@@ -8,29 +8,29 @@ use serde::Serialize;
 use tungstenite::Bytes;
 
 use super::controls::Wheel;
-use super::messages::{Hello, Request, State, Trace, frame};
+use super::messages::{Hello, Request, State, TrailPoint, frame};
 
-/// Simulated time between points of the way on the map, s.
-const TRACE_S: f64 = 0.2;
-/// Points kept of a way: a quarter of an hour. Of a longer one the older half is forgotten.
-const MOST_TRACES: usize = 4500;
+/// Simulated time between two points of the trail, s.
+const POINT_INTERVAL_S: f64 = 0.2;
+/// Largest number of points of a trail: a quarter of an hour. Of a longer trail the older half is dropped.
+const MAX_POINTS: usize = 4500;
 
-/// The newest frame, and the way up to it.
+/// The newest frame, and the trail up to it.
 #[derive(Debug, Default)]
 struct Newest {
     number: u64,
     message: Bytes,
-    way: u64,
-    traces: Vec<Trace>,
-    /// Time of the last trace, s.
-    traced_s: f64,
+    trail_id: u64,
+    trail: Vec<TrailPoint>,
+    /// Simulated time of the last point, s.
+    last_point_s: f64,
 }
 
-/// See the module.
+/// What the drive and the connections share.
 #[derive(Debug)]
 pub(super) struct Hub {
     hello: Hello,
-    /// Present where a person may drive.
+    /// The wheel, if a person may drive.
     wheel: Option<Mutex<Wheel>>,
     newest: Mutex<Newest>,
     viewers: AtomicUsize,
@@ -43,11 +43,11 @@ struct Opening<'a> {
     id: u64,
     #[serde(flatten)]
     hello: &'a Hello,
-    trail: &'a [Trace],
+    trail: &'a [TrailPoint],
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    // Whatever a thread left behind that panicked, it is a number or a picture, and the next overwrites it.
+    // A thread that panicked can leave at most a wrong number or picture, which the next frame overwrites.
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
@@ -66,7 +66,7 @@ impl Hub {
         self.viewers.load(Ordering::Relaxed)
     }
 
-    /// Counts a viewer until what is returned is dropped.
+    /// Counts a viewer until the returned guard is dropped.
     pub fn enter(&self, id: u64) -> Viewer<'_> {
         self.viewers.fetch_add(1, Ordering::Relaxed);
         Viewer { hub: self, id }
@@ -75,11 +75,11 @@ impl Hub {
     /// The first message to connection `id`.
     pub fn opening(&self, id: u64) -> String {
         let newest = lock(&self.newest);
-        let opening = Opening { id, hello: &self.hello, trail: &newest.traces };
+        let opening = Opening { id, hello: &self.hello, trail: &newest.trail };
         serde_json::to_string(&opening).expect("numbers, words and lists can be written as JSON")
     }
 
-    /// Makes a frame the newest. Pictures are asked for only if somebody looks on.
+    /// Makes a frame the newest.
     pub fn publish(&self, state: &State, camera: &[u8], saliency: &[u8]) {
         let message = Bytes::from(frame(state, camera, saliency));
         let mut newest = lock(&self.newest);
@@ -87,21 +87,21 @@ impl Hub {
         newest.message = message;
     }
 
-    /// Draws the way on, whether or not somebody looks on.
-    pub fn trace(&self, state: &State) {
+    /// Adds the car's place to the trail.
+    pub fn extend_trail(&self, state: &State) {
         let mut newest = lock(&self.newest);
-        // Time that runs backwards is another drive's.
-        if newest.way != state.way || state.time_s < newest.traced_s || newest.traces.is_empty() {
-            newest.traces.clear();
-            (newest.way, newest.traced_s) = (state.way, f64::NEG_INFINITY);
+        // Time that goes back begins another drive.
+        if newest.trail_id != state.trail_id || state.time_s < newest.last_point_s || newest.trail.is_empty() {
+            newest.trail.clear();
+            (newest.trail_id, newest.last_point_s) = (state.trail_id, f64::NEG_INFINITY);
         }
-        // Times are multiples of a step, but for rounding.
-        if state.time_s - newest.traced_s > TRACE_S - 1e-6 {
-            if newest.traces.len() >= MOST_TRACES {
-                newest.traces.drain(..MOST_TRACES / 2);
+        // The tolerance covers rounding: times are multiples of a step.
+        if state.time_s - newest.last_point_s > POINT_INTERVAL_S - 1e-6 {
+            if newest.trail.len() >= MAX_POINTS {
+                newest.trail.drain(..MAX_POINTS / 2);
             }
-            newest.traced_s = state.time_s;
-            newest.traces.push(Trace(state.x as f32, state.y as f32, state.cte_m as f32));
+            newest.last_point_s = state.time_s;
+            newest.trail.push(TrailPoint(state.x as f32, state.y as f32, state.cte_m as f32));
         }
     }
 
@@ -111,30 +111,30 @@ impl Hub {
         (newest.number > seen).then(|| (newest.number, newest.message.clone()))
     }
 
-    /// Takes a request of connection `id`.
+    /// Handles a request of connection `id`.
     pub fn request(&self, id: u64, request: Request) {
         if let Some(wheel) = &self.wheel {
             lock(wheel).take(id, request, Instant::now());
         }
     }
 
-    /// The wheel, where a person may drive.
+    /// The wheel, locked, if a person may drive.
     pub fn wheel(&self) -> Option<MutexGuard<'_, Wheel>> {
         self.wheel.as_ref().map(lock)
     }
 
-    /// Ends everything, with these last words; the first count.
+    /// Ends the page with these last words. Only the first call counts.
     pub fn end(&self, words: &str) {
         self.over.get_or_init(|| words.to_string());
     }
 
-    /// The last words, when they are said.
+    /// The last words, if the end has come.
     pub fn over(&self) -> Option<&str> {
         self.over.get().map(String::as_str)
     }
 }
 
-/// Somebody who looks on.
+/// Counts an open page, and releases its wheel at the end.
 pub(super) struct Viewer<'a> {
     hub: &'a Hub,
     id: u64,
@@ -154,25 +154,25 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_late_viewer_sees_the_way_so_far_and_a_new_way_begins_clean() {
+    fn a_late_viewer_sees_the_trail_so_far_and_a_new_trail_begins_empty() {
         let hub = Hub::new(Hello::default(), false);
-        let state = |way, time_s| State { way, time_s, x: time_s, ..State::default() };
+        let state = |trail_id, time_s| State { trail_id, time_s, x: time_s, ..State::default() };
         for k in 0..200 {
-            hub.trace(&state(0, f64::from(k) * 0.05));
+            hub.extend_trail(&state(0, f64::from(k) * 0.05));
         }
         let trail = |hub: &Hub| serde_json::from_str::<serde_json::Value>(&hub.opening(7)).unwrap()["trail"].clone();
         assert_eq!(trail(&hub).as_array().unwrap().len(), 50);
-        hub.trace(&state(1, 3.0));
+        hub.extend_trail(&state(1, 3.0));
         assert_eq!(trail(&hub), serde_json::json!([[3.0, 0.0, 0.0]]));
         for k in 0..20_000 {
-            hub.trace(&state(2, f64::from(k)));
+            hub.extend_trail(&state(2, f64::from(k)));
         }
         let all = trail(&hub);
         let all = all.as_array().unwrap();
-        assert!((MOST_TRACES / 2..=MOST_TRACES).contains(&all.len()), "{}", all.len());
+        assert!((MAX_POINTS / 2..=MAX_POINTS).contains(&all.len()), "{}", all.len());
         let next = |k: usize| all[k + 1][0].as_f64().unwrap() - all[k][0].as_f64().unwrap();
         assert!((0..all.len() - 1).all(|k| next(k) == next(0)), "no gaps: pages do not draw across them");
-        hub.trace(&state(2, 1.0));
+        hub.extend_trail(&state(2, 1.0));
         assert_eq!(trail(&hub).as_array().unwrap().len(), 1, "another drive");
     }
 

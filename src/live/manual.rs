@@ -1,35 +1,36 @@
-//! A person drives with the page, and what they do is recorded in the format of Udacity's simulator.
+//! A person drives with the page, and the program records the drive in the format of Udacity's simulator.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::time::Instant;
 
 use serde::Serialize;
 
-use super::clock::Clock;
-use super::controls::{Cockpit, Event};
+use super::controls::{Action, Cockpit};
 use super::coverage::{Coverage, Row, Shares};
 use super::messages::{Hello, Manual, State};
+use super::real_time::RealTime;
 use super::server::Live;
 use crate::error::{Error, Result};
 use crate::files::new_folder::NewFolder;
-use crate::simulator::camera::eye::Eye;
+use crate::observer::StopSignal;
+use crate::simulator::camera::front_camera::FrontCamera;
 use crate::simulator::car::dynamics::{Controls, MPS_PER_MPH, STEP_S, STEPS_PER_S};
-use crate::simulator::recorder::record::{RecordingInfo, Sample};
+use crate::simulator::recorder::options::RecordingInfo;
+use crate::simulator::recorder::sample::Sample;
 use crate::simulator::recorder::writer::RowWriter;
 use crate::simulator::{RecordOptions, Simulation, Start, Track};
 
-/// What is said where the program itself is at fault.
+/// The message for a fault of this program.
 const FAULT: &str = "the recording ended early";
 
-/// Steps between frames: 25 frames a second.
+/// Steps between two frames: 25 frames per second.
 const STEPS_PER_FRAME: u64 = 2;
-/// Beyond this distance from the edge of the road the car is put back, m.
-const LOST_M: f64 = 12.0;
+/// Largest distance from the edge of the road, m. Beyond it the car is put back.
+const MAX_OFF_ROAD_M: f64 = 12.0;
 
-/// A drive by hand, about to begin: its folder and its port are there.
+/// A drive by hand that is ready to begin: it has its folder and its port.
 pub struct ManualDrive<'a> {
     track: &'a Track,
     options: &'a RecordOptions,
@@ -39,27 +40,27 @@ pub struct ManualDrive<'a> {
     live: Live,
 }
 
-/// What a drive by hand came to.
+/// The result of a drive by hand.
 #[derive(Clone, Debug, Serialize)]
 pub struct ManualSummary {
-    /// What stands in `recording.toml`.
+    /// The content of `recording.toml`.
     #[serde(flatten)]
     pub info: RecordingInfo,
-    /// The recording, if anything was recorded.
+    /// The folder of the recording, if a row was recorded.
     pub folder: Option<PathBuf>,
-    /// What it covers.
+    /// What the recording covers.
     pub coverage: Shares,
-    /// What it lacks.
+    /// What the recording lacks.
     pub advice: Vec<String>,
 }
 
 impl<'a> ManualDrive<'a> {
-    /// Prepares the folder `out` and serves the page at `port`. Of `options` count the light (`seed`), the direction, the
-    /// highest speed, the rows a second and the log's format.
+    /// Prepares the folder `out` and serves the page at `port`. Uses these `options`: the light (`seed`), the direction, the
+    /// highest speed, the rows per second and the format of the log.
     ///
     /// # Errors
     ///
-    /// Impossible options, a folder that exists, a port that cannot be had.
+    /// [`Error::Usage`] for impossible options or a folder that exists, [`Error::System`] if the port is taken.
     pub fn prepare(track: &'a Track, options: &'a RecordOptions, out: &'a Path, port: u16) -> Result<ManualDrive<'a>> {
         options.check()?;
         let folder = NewFolder::create(out)?;
@@ -69,44 +70,44 @@ impl<'a> ManualDrive<'a> {
         Ok(ManualDrive { track, options, out, folder, writer, live })
     }
 
-    /// What to open in a browser.
+    /// The address to open in a browser.
     pub fn url(&self) -> String {
         self.live.url()
     }
 
-    /// Lets pages drive until one finishes or `stop` is set, and gives the recording its name.
+    /// Lets pages drive until one of them finishes or `stop` is requested, and gives the recording its name.
     ///
     /// # Errors
     ///
-    /// If something cannot be written. What was recorded until then is kept, and the message says where.
-    pub fn run(self, stop: &AtomicBool) -> Result<ManualSummary> {
+    /// [`Error::EndedEarly`] if something cannot be written. It keeps what was recorded and names the folder.
+    pub fn run(self, stop: &StopSignal) -> Result<ManualSummary> {
         let ManualDrive { track, options, out, folder, writer, live } = self;
         let (sender, samples) = channel();
-        let mut session = Session::new(track, options, &live, sender);
+        let mut manual = ManualLoop::new(track, options, &live, sender);
         let (drive, written) = std::thread::scope(|scope| {
             let writing = scope.spawn(move || write(writer, &samples));
-            let mut clock = Clock::start(Instant::now());
+            let mut real_time = RealTime::start(Instant::now());
             let (mut steps, mut drive) = (0u64, Ok(true));
-            while matches!(drive, Ok(true)) && !stop.load(Ordering::Relaxed) && !writing.is_finished() {
-                std::thread::sleep(clock.until(steps as f64 * STEP_S, Instant::now()));
-                // A fault here must not take with it what was recorded, nor leave the writer waiting.
-                let step = catch_unwind(AssertUnwindSafe(|| session.step()));
+            while matches!(drive, Ok(true)) && !stop.requested() && !writing.is_finished() {
+                std::thread::sleep(real_time.until(steps as f64 * STEP_S, Instant::now()));
+                // A fault here must not lose the recording, nor leave the writer waiting.
+                let step = catch_unwind(AssertUnwindSafe(|| manual.step()));
                 drive = step.unwrap_or_else(|_| Err(Error::Fault(FAULT.into())));
                 steps += 1;
             }
-            session.samples = None;
+            manual.samples = None;
             if !writing.is_finished() {
                 eprintln!("writing the last rows");
             }
             (drive, writing.join())
         });
         let (rows, trouble) = written.unwrap_or_else(|_| {
-            (session.coverage.shares(options.hz, track.length_m).rows, Some(Error::Fault(FAULT.into())))
+            (manual.coverage.shares(options.hz, track.length_m).rows, Some(Error::Fault(FAULT.into())))
         });
         let trouble = drive.err().or(trouble);
-        let advice = session.coverage.advice(track.length_m);
-        let coverage = session.coverage.shares(options.hz, track.length_m);
-        drop(session);
+        let advice = manual.coverage.advice(track.length_m);
+        let coverage = manual.coverage.shares(options.hz, track.length_m);
+        drop(manual);
         let info = RecordingInfo {
             laps: (coverage.laps * 1000.0).round() / 1000.0,
             style: "manual".into(),
@@ -116,7 +117,7 @@ impl<'a> ManualDrive<'a> {
             Err(error) if rows > 0 => trouble.or(Some(error)),
             _ => trouble,
         };
-        // The place that was meant; the hidden one is no more when the message is read.
+        // The message names the intended place: the hidden one is gone when the user reads it.
         let hidden = folder.unfinished().to_path_buf();
         let trouble = trouble.map(|error| match error {
             Error::Io { path, source } => {
@@ -140,7 +141,7 @@ impl<'a> ManualDrive<'a> {
     }
 }
 
-/// Writes rows until there are no more or one cannot be written; returns their number.
+/// Writes rows until the sender is dropped or a row cannot be written. Returns their number and the error.
 fn write(mut writer: RowWriter, samples: &Receiver<Sample>) -> (usize, Option<Error>) {
     let mut rows = 0;
     for sample in samples {
@@ -152,32 +153,32 @@ fn write(mut writer: RowWriter, samples: &Receiver<Sample>) -> (usize, Option<Er
     (rows, None)
 }
 
-/// The car, the person at the wheel, and what is recorded.
-struct Session<'a> {
+/// The car, its driver and the recording, one step after another.
+struct ManualLoop<'a> {
     options: &'a RecordOptions,
     live: &'a Live,
     simulation: Simulation<'a>,
-    eye: Eye<'a>,
+    eye: FrontCamera<'a>,
     cockpit: Cockpit,
     recording: bool,
     notice: String,
     put_back: usize,
     coverage: Coverage,
-    /// Way made at the last row, m.
+    /// Distance driven until the last row, m.
     row_way_m: f64,
-    /// Where rows go; `None` at the end.
+    /// The queue of the writer; `None` at the end.
     samples: Option<Sender<Sample>>,
 }
 
-impl<'a> Session<'a> {
-    fn new(track: &'a Track, options: &'a RecordOptions, live: &'a Live, samples: Sender<Sample>) -> Session<'a> {
+impl<'a> ManualLoop<'a> {
+    fn new(track: &'a Track, options: &'a RecordOptions, live: &'a Live, samples: Sender<Sample>) -> ManualLoop<'a> {
         let start =
             Start { reverse: options.reverse, offset_m: 0.0, heading_deg: 0.0, ..Start::draw(track, options.seed) };
-        Session {
+        ManualLoop {
             options,
             live,
             simulation: Simulation::new(track, start, 0.0),
-            eye: Eye::new(track, options.seed),
+            eye: FrontCamera::new(track, options.seed),
             cockpit: Cockpit::default(),
             recording: false,
             notice: "Hold W or the up arrow to drive, R to record.".into(),
@@ -188,18 +189,18 @@ impl<'a> Session<'a> {
         }
     }
 
-    /// Drives a step of 20 ms. `false` if the person at the wheel has finished.
+    /// Simulates a step of 20 ms. Returns `false` if the driver has finished.
     fn step(&mut self) -> Result<bool> {
         let now = Instant::now();
-        let look = |wheel: &mut super::controls::Wheel| (wheel.holder(now), wheel.input(now), wheel.take_events());
-        let (driver, input, events) = self.live.with_wheel(look).unwrap_or_default();
-        for event in events {
-            match event {
-                Event::Record => self.record(!self.recording),
-                Event::Cruise => self.cockpit.cruise = !self.cockpit.cruise,
-                Event::PutBack => self.put(false, "The car was put back."),
-                Event::TurnRound => self.put(true, "The car was turned round."),
-                Event::Finish => return Ok(false),
+        let look = |wheel: &mut super::controls::Wheel| (wheel.holder(now), wheel.input(now), wheel.take_actions());
+        let (driver, input, actions) = self.live.with_wheel(look).unwrap_or_default();
+        for action in actions {
+            match action {
+                Action::Record => self.record(!self.recording),
+                Action::Cruise => self.cockpit.cruise = !self.cockpit.cruise,
+                Action::PutBack => self.put(false, "The car was put back."),
+                Action::TurnRound => self.put(true, "The car was turned round."),
+                Action::Finish => return Ok(false),
             }
         }
         if driver.is_none() && self.recording {
@@ -215,7 +216,7 @@ impl<'a> Session<'a> {
         let edge_m = self.simulation.track.at(self.simulation.location.s_m).width_m / 2.0;
         if self.simulation.at_wall {
             self.rescue("The car hit a wall and was put back");
-        } else if self.simulation.cte_m().abs() > edge_m + LOST_M {
+        } else if self.simulation.cte_m().abs() > edge_m + MAX_OFF_ROAD_M {
             self.rescue("The car was far off the road and was put back");
         }
         if self.simulation.steps.is_multiple_of(STEPS_PER_FRAME) {
@@ -224,7 +225,7 @@ impl<'a> Session<'a> {
         Ok(true)
     }
 
-    /// Puts the car back after an accident; what led there is not to be learned any further.
+    /// Puts the car back after an accident and pauses the recording.
     fn rescue(&mut self, what: &str) {
         let then = if self.recording { "; recording is paused." } else { "." };
         self.record(false);
@@ -243,14 +244,14 @@ impl<'a> Session<'a> {
         let start =
             Start { s_m: simulation.location.s_m, reverse: simulation.reverse, offset_m: 0.0, heading_deg: 0.0 };
         simulation.put(start, 0.0);
-        // A pause in the names of the pictures, so that a reader sees that the road does not go on.
+        // A gap in the times of the pictures tells readers that the drive is not continuous here.
         simulation.steps += 2 * STEPS_PER_S;
         self.cockpit = Cockpit::default();
         self.put_back += 1;
         self.notice = notice.into();
     }
 
-    /// Records where the car is and what it is told.
+    /// Records a row: the pose of the car and its controls.
     fn row(&mut self, controls: Controls, speed_mph: f64) {
         let simulation = &self.simulation;
         self.coverage.add(&Row {
@@ -270,14 +271,14 @@ impl<'a> Session<'a> {
             speed_mph,
         };
         if let Some(samples) = &self.samples {
-            // A writer that has ended is noticed, and its error told, before the next step.
+            // `run` notices before the next step that the writer has ended.
             let _ = samples.send(sample);
         }
     }
 
     fn show(&mut self, driver: Option<u64>, controls: Controls) -> Result<()> {
         let mut state = State::of(&self.simulation);
-        self.live.trace(&state);
+        self.live.extend_trail(&state);
         if self.live.viewers() == 0 {
             return Ok(());
         }

@@ -1,33 +1,33 @@
-//! What the page and the program tell each other.
+//! The messages between the page and the program.
 //!
-//! From the page come [`Request`]s as JSON text. To it goes one [`Hello`] as JSON text, then for each frame that it asked for a
-//! binary message, see [`frame`], and at last a [`Farewell`].
+//! The page sends [`Request`]s as JSON text. The program sends one [`Hello`] as JSON text, a binary message for each frame that
+//! the page asked for (see [`frame`]), and at the end a [`Farewell`].
 
 use serde::{Deserialize, Serialize};
 
 use super::coverage::Shares;
-use crate::report::map;
-use crate::report::palette::heat_hex;
+use crate::report::charts::map;
+use crate::report::charts::palette::heat_hex;
 use crate::simulator::car::dynamics::MAX_STEER_DEG;
 use crate::simulator::car::expert::pursuit;
 use crate::simulator::car::speed::telemetry_mph;
 use crate::simulator::{Simulation, Track};
 
-/// What the page asks for.
+/// A request of the page.
 #[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
 #[serde(tag = "type", rename_all = "snake_case", deny_unknown_fields)]
 pub enum Request {
     /// The next frame.
     Next,
-    /// What is pressed; sent whenever it changes, and several times a second.
+    /// The input. The page sends it whenever it changes, and several times per second.
     Controls(Input),
-    /// Take the wheel, whoever has it.
+    /// Take the wheel, even if another page holds it.
     Take,
-    /// Let go of the wheel.
+    /// Release the wheel.
     Leave,
     /// Begin to record, or pause.
     Record,
-    /// Hold the accelerator, or let go.
+    /// Hold the accelerator, or release it.
     Cruise,
     /// Put the car back onto the middle of the road, standing.
     PutBack,
@@ -37,7 +37,7 @@ pub enum Request {
     Finish,
 }
 
-/// Keys, mouse and gamepad. What is out of range counts as the nearest that is not.
+/// Keys, mouse and gamepad. Values out of range count as the nearest value in range.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Input {
@@ -47,15 +47,15 @@ pub struct Input {
     /// Keys of the pedals: -1 brake, +1 accelerator, 0 none.
     #[serde(default)]
     pub pedal: f64,
-    /// Where mouse or gamepad hold the wheel, [-1, 1], + = right; they win over keys.
+    /// Wheel of the mouse or gamepad, [-1, 1], + = right. It takes precedence over the keys.
     #[serde(default)]
     pub wheel: Option<f64>,
-    /// Where the gamepad holds the pedals, [-1, 1], from the brake to the accelerator; it wins over keys.
+    /// Pedals of the gamepad, [-1, 1], from the brake to the accelerator. They take precedence over the keys.
     #[serde(default)]
     pub pedals: Option<f64>,
 }
 
-/// What does not change during a drive.
+/// What stays the same during a drive.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct Hello {
     /// `watch` or `manual`.
@@ -64,7 +64,7 @@ pub struct Hello {
     pub subject: String,
     /// The track.
     pub track: String,
-    /// Whether training must not see it.
+    /// Whether the track is held out: training must not see it.
     pub held_out: bool,
     /// Length of a lap, m.
     pub lap_m: f64,
@@ -72,14 +72,14 @@ pub struct Hello {
     pub edges: Vec<Vec<[f64; 2]>>,
     /// Wheel angle at steering 1, deg.
     pub full_lock_deg: f64,
-    /// Colours of a way by its distance from the line, from none to `darkest_m`.
+    /// Colours of the trail by its distance from the line, from 0 to `darkest_m`.
     pub heat: Vec<String>,
     /// Distance from the line of the last colour, m.
     pub darkest_m: f64,
 }
 
 impl Hello {
-    /// What a page is told of a drive on `track`.
+    /// The greeting for a drive on `track`.
     pub fn new(mode: &'static str, subject: String, track: &Track) -> Hello {
         Hello {
             mode,
@@ -95,9 +95,9 @@ impl Hello {
     }
 }
 
-/// A point of the way so far.
+/// A point of the trail.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-pub struct Trace(
+pub struct TrailPoint(
     /// East, m.
     pub f32,
     /// North, m.
@@ -109,10 +109,10 @@ pub struct Trace(
 /// The car at the moment of a frame.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct State {
-    /// What is driven, in words.
+    /// Title of the run.
     pub title: String,
-    /// Counts the ways: where it changes, the car was put elsewhere and a new way begins on a clean map.
-    pub way: u64,
+    /// Number of the trail. When it changes, the car was put elsewhere, and the page begins a new trail.
+    pub trail_id: u64,
     /// Simulated time, s.
     pub time_s: f64,
     /// East, m.
@@ -123,27 +123,27 @@ pub struct State {
     pub heading: [f64; 2],
     /// Steering, [-1, 1], + = right.
     pub steering: f64,
-    /// What the expert would steer here.
+    /// Steering of the expert at this place, [-1, 1], + = right.
     pub expert: f64,
-    /// [-1, 1], from the brake to the accelerator.
+    /// Throttle, [-1, 1], from the brake to the accelerator.
     pub throttle: f64,
     /// Speed, mph.
     pub speed_mph: f64,
     /// Cross-track error, m, + = right as driven.
     pub cte_m: f64,
-    /// Laps driven; they fall when the car goes back.
+    /// Laps driven. The number falls when the car drives back.
     pub laps: f64,
-    /// Wheels off the road.
+    /// Number of wheels off the road.
     pub wheels_off: usize,
-    /// Times the car was put back on this way.
+    /// How often the car was put back on this trail.
     pub put_back: usize,
-    /// Driving by hand: what there is to know about the recording.
+    /// State of the recording, when a person drives.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub manual: Option<Manual>,
 }
 
 impl State {
-    /// The car as it stands; steering, throttle and titles are for whoever knows them.
+    /// The state of the car. The caller adds steering, throttle and title.
     pub fn of(simulation: &Simulation) -> State {
         let car = &simulation.car;
         State {
@@ -161,41 +161,41 @@ impl State {
     }
 }
 
-/// How driving by hand goes.
+/// State of a drive by hand.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct Manual {
-    /// Connection that has the wheel.
+    /// Connection that holds the wheel.
     pub driver: Option<u64>,
-    /// Rows are being recorded.
+    /// Whether rows are being recorded.
     pub recording: bool,
-    /// The accelerator is held.
+    /// Whether the accelerator is held.
     pub cruise: bool,
-    /// What just happened, in words.
+    /// What just happened.
     pub notice: String,
-    /// What was recorded.
+    /// What the recording covers.
     #[serde(flatten)]
     pub coverage: Shares,
-    /// What to do next, the weightiest first.
+    /// What to do next, the most important first.
     pub advice: Vec<String>,
 }
 
-/// The end.
+/// The last message.
 #[derive(Clone, Debug, Serialize)]
 pub struct Farewell {
-    /// How it ended, in words.
+    /// How the drive ended.
     pub over: String,
 }
 
-/// The message of a frame: the length of a JSON [`State`] as 4 bytes (little endian), the JSON, the length of the camera's
-/// JPEG likewise, the JPEG, and for the rest a JPEG of the same picture with its saliency, if there is one.
-pub fn frame(state: &State, camera: &[u8], saliency: &[u8]) -> Vec<u8> {
+/// The message of a frame: the length of the [`State`] in bytes (u32, little endian), the state as JSON, the length of the
+/// camera's JPEG (the same), the JPEG, and the JPEG of the same picture with its saliency, or nothing.
+pub fn frame(state: &State, camera_jpeg: &[u8], saliency_jpeg: &[u8]) -> Vec<u8> {
     let json = serde_json::to_vec(state).expect("numbers, words and lists can be written as JSON");
-    let mut message = Vec::with_capacity(8 + json.len() + camera.len() + saliency.len());
-    for part in [&json[..], camera] {
+    let mut message = Vec::with_capacity(8 + json.len() + camera_jpeg.len() + saliency_jpeg.len());
+    for part in [&json[..], camera_jpeg] {
         message.extend((part.len() as u32).to_le_bytes());
         message.extend(part);
     }
-    message.extend(saliency);
+    message.extend(saliency_jpeg);
     message
 }
 

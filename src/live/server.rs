@@ -1,4 +1,4 @@
-//! The page and its WebSocket, on this machine only.
+//! Serves the page and its WebSocket, to this machine only.
 
 use std::io::{Read as _, Write as _};
 use std::net::{Ipv4Addr, SocketAddr, TcpListener, TcpStream};
@@ -15,38 +15,39 @@ use super::controls::Wheel;
 use super::hub::Hub;
 use super::messages::{Farewell, Hello, Request, State};
 use crate::error::{Error, Result};
+use crate::net::handshake;
 use crate::net::http::{self, BadHead, Head};
-use crate::serve::socket::{Socket, is_timeout};
+use crate::net::socket::{Socket, is_timeout};
 
-/// Port of the page, unless told otherwise.
+/// Default port of the page.
 pub const DEFAULT_PORT: u16 = 4568;
-/// The page, whole.
+/// The whole page.
 const PAGE: &str = include_str!("page.html");
 /// The path of the WebSocket.
 const SOCKET_PATH: &str = "/live";
-/// Nothing is loaded from elsewhere, and no other page may show this one in a frame and have its buttons pressed.
+/// Headers of the page. It loads nothing from elsewhere, and no other page may show it in a frame and click its buttons.
 const HEADERS: &str = "Content-Security-Policy: default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; \
     img-src data:; connect-src 'self' ws://127.0.0.1:* ws://localhost:*; base-uri 'none'; form-action 'none'; \
     frame-ancestors 'none'\r\nX-Frame-Options: DENY\r\nX-Content-Type-Options: nosniff\r\nReferrer-Policy: no-referrer\r\n\
     Cache-Control: no-store\r\n";
-/// Connections that are kept at once.
+/// Largest number of open connections.
 const MAX_CONNECTIONS: usize = 32;
-/// Time for a whole request.
-const REQUEST_TIME: Duration = Duration::from_secs(5);
+/// Longest time for a whole request.
+const MAX_REQUEST_TIME: Duration = Duration::from_secs(5);
 /// Time that a browser has to read the last words.
 const FAREWELL: Duration = Duration::from_millis(300);
-/// Pause between looks at the listener.
+/// Pause between two checks of the listener.
 const LISTEN_PAUSE: Duration = Duration::from_millis(5);
-/// Beat of a connection that waits for a frame; the most that a frame is late.
-const QUICK_BEAT: Duration = Duration::from_millis(4);
-/// Beat of one that has time.
-const SLOW_BEAT: Duration = Duration::from_millis(40);
-/// Largest message of a page, bytes.
+/// Tick of a connection that waits for a frame: the longest delay of a frame.
+const QUICK_TICK: Duration = Duration::from_millis(4);
+/// Tick of the other connections.
+const SLOW_TICK: Duration = Duration::from_millis(40);
+/// Longest message of a page, bytes.
 const MAX_MESSAGE: usize = 4096;
 /// Stack of a connection's thread, bytes.
 const STACK: usize = 1 << 20;
 
-/// A page that is being served, in threads of its own, until it is dropped.
+/// Serves a page in threads of its own until it is dropped.
 #[derive(Debug)]
 pub struct Live {
     hub: Arc<Hub>,
@@ -55,7 +56,7 @@ pub struct Live {
 }
 
 impl Live {
-    /// Serves the page at `port` of loopback; 0 takes any free one. `by_hand` lets a person drive with it.
+    /// Serves the page at `port` of the loopback address; 0 takes any free port. `by_hand` lets a person drive.
     ///
     /// # Errors
     ///
@@ -72,32 +73,32 @@ impl Live {
         Ok(Live { hub, address, listener: Some(listener) })
     }
 
-    /// What to open in a browser.
+    /// The address to open in a browser.
     pub fn url(&self) -> String {
         format!("http://{}/", self.address)
     }
 
-    /// Pages that are open.
+    /// Number of open pages.
     pub fn viewers(&self) -> usize {
         self.hub.viewers()
     }
 
-    /// Draws the car's way on. Cheap, and wanted even while nobody looks on: who comes late sees the whole way.
-    pub fn trace(&self, state: &State) {
-        self.hub.trace(state);
+    /// Adds the car's place to the trail. Cheap, and needed without a viewer, too: a late viewer gets the whole trail.
+    pub fn extend_trail(&self, state: &State) {
+        self.hub.extend_trail(state);
     }
 
-    /// Shows a frame: JPEGs of the camera and, or empty, of the same with saliency.
-    pub fn publish(&self, state: &State, camera: &[u8], saliency: &[u8]) {
-        self.hub.publish(state, camera, saliency);
+    /// Shows a frame: the JPEG of the camera, and the JPEG of the same picture with saliency, or nothing.
+    pub fn publish(&self, state: &State, camera_jpeg: &[u8], saliency_jpeg: &[u8]) {
+        self.hub.publish(state, camera_jpeg, saliency_jpeg);
     }
 
-    /// Looks at the wheel, where a person may drive.
+    /// Calls `look` with the wheel, if a person may drive.
     pub fn with_wheel<T>(&self, look: impl FnOnce(&mut Wheel) -> T) -> Option<T> {
         self.hub.wheel().map(|mut wheel| look(&mut wheel))
     }
 
-    /// Tells every page how it ended, and closes.
+    /// Tells every page how the drive ended, and closes the connections.
     pub fn finish(mut self, words: &str) {
         self.close(words);
     }
@@ -105,7 +106,7 @@ impl Live {
     fn close(&mut self, words: &str) {
         self.hub.end(words);
         if let Some(listener) = self.listener.take() {
-            // If it panicked it has ended, too.
+            // A panic is an end, too.
             let _ = listener.join();
         }
     }
@@ -117,14 +118,14 @@ impl Drop for Live {
     }
 }
 
-/// Accepts connections until the end, and waits for theirs.
+/// Accepts connections until the end, and waits until they have ended.
 fn listen(listener: &TcpListener, port: u16, hub: &Hub) {
     let open = AtomicUsize::new(0);
     std::thread::scope(|scope| {
         let mut id = 0;
         while hub.over().is_none() {
             let Ok((stream, _)) = listener.accept() else {
-                // Nobody there, or the connection is gone already, or the process has no file left for it.
+                // No client, or the connection is gone already, or the process has no file handle left.
                 std::thread::sleep(LISTEN_PAUSE);
                 continue;
             };
@@ -136,7 +137,7 @@ fn listen(listener: &TcpListener, port: u16, hub: &Hub) {
             let open = &open;
             let thread = std::thread::Builder::new().name(format!("viewer {id}")).stack_size(STACK);
             let serve = move || {
-                // A connection that fails is gone; the browser opens another.
+                // The browser opens another connection if this one fails.
                 let _ = catch_unwind(AssertUnwindSafe(|| serve(stream, id, port, hub)));
                 open.fetch_sub(1, Ordering::Relaxed);
             };
@@ -147,14 +148,14 @@ fn listen(listener: &TcpListener, port: u16, hub: &Hub) {
     });
 }
 
-/// Answers one request. Errors end the connection, and nobody is left to hear of them.
+/// Answers one request. An error ends the connection; there is no one to tell.
 fn serve(stream: TcpStream, id: u64, port: u16, hub: &Hub) -> std::io::Result<()> {
-    let mut socket = Socket::new(stream, SLOW_BEAT)?;
+    let mut socket = Socket::new(stream, SLOW_TICK)?;
     let began = Instant::now();
     let mut bytes = Vec::with_capacity(1024);
-    while began.elapsed() < REQUEST_TIME && hub.over().is_none() {
+    while began.elapsed() < MAX_REQUEST_TIME && hub.over().is_none() {
         let mut chunk = [0; 1024];
-        socket.begin_beat();
+        socket.begin_tick();
         match socket.read(&mut chunk) {
             Ok(0) => return Ok(()),
             Ok(len) => bytes.extend_from_slice(&chunk[..len]),
@@ -185,9 +186,9 @@ fn serve(stream: TcpStream, id: u64, port: u16, hub: &Hub) -> std::io::Result<()
     Ok(())
 }
 
-/// What a request gets.
+/// The answer to a request.
 enum Answer {
-    /// The whole answer; the connection is closed then.
+    /// The whole response, after which the connection closes.
     Say(String),
     /// A WebSocket after the `len` bytes of the request.
     Open { response: String, len: usize },
@@ -197,7 +198,7 @@ fn answer(head: &Head, port: u16) -> Answer {
     let refuse = |status: &str, sentence: &str| Answer::Say(http::plain(status, sentence));
     let mut own = vec![format!("127.0.0.1:{port}"), format!("localhost:{port}")];
     if port == 80 {
-        // Browsers leave it out.
+        // Browsers leave port 80 out.
         own.extend(["127.0.0.1".into(), "localhost".into()]);
     }
     let is_own = |host: &str| own.iter().any(|own| own.eq_ignore_ascii_case(host));
@@ -217,16 +218,16 @@ fn answer(head: &Head, port: u16) -> Answer {
     if head.origin().is_some_and(|origin| origin.trim() != format!("http://{host}")) {
         return refuse("403 Forbidden", "only the page that is served here may connect");
     }
-    if !head.wants_websocket() {
+    if !handshake::is_requested(head) {
         return refuse("426 Upgrade Required\r\nUpgrade: websocket", "a WebSocket is expected here");
     }
-    match head.accept_websocket() {
+    match handshake::accept(head) {
         Ok(response) => Answer::Open { response, len: head.len },
         Err((status, sentence)) => refuse(status, sentence),
     }
 }
 
-/// Shows the drive to one page until either ends.
+/// Shows the drive to one page until the drive or the page ends.
 fn show(socket: Socket, rest: Vec<u8>, id: u64, hub: &Hub) {
     let config = WebSocketConfig::default()
         .read_buffer_size(MAX_MESSAGE)
@@ -235,7 +236,7 @@ fn show(socket: Socket, rest: Vec<u8>, id: u64, hub: &Hub) {
         .max_frame_size(Some(MAX_MESSAGE));
     let mut socket = WebSocket::from_partially_read(socket, rest, Role::Server, Some(config));
     let viewer = hub.enter(id);
-    // A page that cannot be talked to any more is gone.
+    // An error means that the page is gone.
     let shown = frames(&mut socket, id, hub);
     drop(viewer);
     if shown.is_ok()
@@ -255,8 +256,8 @@ fn frames(socket: &mut WebSocket<Socket>, id: u64, hub: &Hub) -> tungstenite::Re
     socket.send(Message::text(hub.opening(id)))?;
     let (mut seen, mut wanted) = (0, false);
     while hub.over().is_none() {
-        socket.get_mut().set_beat(if wanted { QUICK_BEAT } else { SLOW_BEAT })?;
-        socket.get_mut().begin_beat();
+        socket.get_mut().set_tick(if wanted { QUICK_TICK } else { SLOW_TICK })?;
+        socket.get_mut().begin_tick();
         match socket.read() {
             Ok(Message::Text(text)) => match serde_json::from_str(&text) {
                 Ok(Request::Next) => wanted = true,

@@ -1,43 +1,43 @@
-//! A closed-loop drive, shown in real time.
+//! Shows a closed-loop drive in real time.
 
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use super::clock::Clock;
 use super::messages::State;
+use super::real_time::RealTime;
 use super::server::Live;
-use crate::dataset::decode::RgbImage;
-use crate::error::{Error, Result};
+use crate::error::Result;
+use crate::observer::{Observer, StopSignal};
+use crate::picture::RgbImage;
 use crate::pilot::Pilot;
-use crate::report::saliency::Saliency;
+use crate::report::explain::saliency::Saliency;
 use crate::simulator::camera::jpeg;
-use crate::simulator::{DriveFrame, DriveObserver, HEIGHT, RunOptions, WIDTH};
+use crate::simulator::{DriveEvent, DriveFrame, HEIGHT, TrialOptions, WIDTH};
 
-/// How soon a wait notices that it is to end.
+/// Longest time until a wait notices that it has to end.
 const TICK: Duration = Duration::from_millis(50);
 
-/// Shows the runs of a drive on a page, and holds them to the clock.
+/// Shows the runs of a drive on a page, in real time.
 pub struct Watch<'a> {
     live: &'a Live,
-    stop: &'a AtomicBool,
+    stop: &'a StopSignal,
     driver: &'a str,
-    /// Who steers once more, to see what excites the network. Never the driver itself, whose drive must not change.
+    /// A copy of the pilot, and its saliency. The driver itself is left alone, so that its drive stays the same.
     saliency: Option<(Pilot, Saliency)>,
     runs: usize,
-    clock: Option<Clock>,
+    real_time: Option<RealTime>,
     title: String,
-    way: u64,
-    /// Seeds begun; a seed may be driven twice.
+    trail_id: u64,
+    /// Number of seeds begun. A seed may be driven twice.
     begun: usize,
     seed: Option<u64>,
     image: RgbImage,
-    camera: Vec<u8>,
+    camera_jpeg: Vec<u8>,
 }
 
 impl<'a> Watch<'a> {
-    /// Shows `runs` seeds of `driver` on `live` until `stop` is set. `pilot` is the model at the wheel, if one is.
-    pub fn new(live: &'a Live, driver: &'a str, pilot: Option<&Pilot>, runs: usize, stop: &'a AtomicBool) -> Watch<'a> {
-        // A network without a convolution has no saliency to show.
+    /// Shows `runs` seeds of `driver` on `live` until `stop` is requested. `pilot` is the model that drives, if any.
+    pub fn new(live: &'a Live, driver: &'a str, pilot: Option<&Pilot>, runs: usize, stop: &'a StopSignal) -> Watch<'a> {
+        // A network without a convolution has no saliency.
         let saliency = pilot.and_then(|pilot| Some((pilot.clone(), Saliency::new(pilot.network()).ok()?)));
         Watch {
             live,
@@ -45,24 +45,22 @@ impl<'a> Watch<'a> {
             driver,
             saliency,
             runs,
-            clock: None,
+            real_time: None,
             title: String::new(),
-            way: 0,
+            trail_id: 0,
             begun: 0,
             seed: None,
             image: RgbImage { height: HEIGHT, width: WIDTH, pixels: vec![0; HEIGHT * WIDTH * 3] },
-            camera: Vec::new(),
+            camera_jpeg: Vec::new(),
         }
     }
 
-    /// Waits until the clock has come as far as the drive.
+    /// Waits until the clock has reached the simulated time `time_s`.
     fn wait(&mut self, time_s: f64) -> Result<()> {
-        let clock = self.clock.get_or_insert_with(|| Clock::start(Instant::now()));
+        let real_time = self.real_time.get_or_insert_with(|| RealTime::start(Instant::now()));
         loop {
-            if self.stop.load(Ordering::Relaxed) {
-                return Err(Error::Interrupted);
-            }
-            let left = clock.until(time_s, Instant::now());
+            self.stop.check()?;
+            let left = real_time.until(time_s, Instant::now());
             if left.is_zero() {
                 return Ok(());
             }
@@ -71,10 +69,20 @@ impl<'a> Watch<'a> {
     }
 }
 
-impl DriveObserver for Watch<'_> {
-    fn begin(&mut self, seed: u64, options: &RunOptions) {
+impl<'e> Observer<DriveEvent<'e>> for Watch<'_> {
+    fn observe(&mut self, event: DriveEvent<'e>) -> Result<()> {
+        match event {
+            DriveEvent::Begin { seed, options } => self.begin(seed, options),
+            DriveEvent::Frame(frame) => return self.frame(frame),
+        }
+        Ok(())
+    }
+}
+
+impl Watch<'_> {
+    fn begin(&mut self, seed: u64, options: &TrialOptions) {
         self.begun += usize::from(self.seed != Some(seed));
-        (self.seed, self.clock, self.way) = (Some(seed), None, self.way + 1);
+        (self.seed, self.real_time, self.trail_id) = (Some(seed), None, self.trail_id + 1);
         let help = if options.assisted { "again, put back when 1 m off the middle" } else { "without help" };
         self.title = format!("{}, run {} of {} (seed {seed}), {help}", self.driver, self.begun, self.runs);
     }
@@ -82,27 +90,27 @@ impl DriveObserver for Watch<'_> {
     fn frame(&mut self, frame: &DriveFrame) -> Result<()> {
         self.wait(frame.simulation.time_s())?;
         let mut state = State {
-            way: self.way,
+            trail_id: self.trail_id,
             steering: frame.steering,
             throttle: frame.throttle,
             put_back: frame.interventions,
             ..State::of(frame.simulation)
         };
-        self.live.trace(&state);
+        self.live.extend_trail(&state);
         if self.live.viewers() == 0 {
             return Ok(());
         }
         state.title.clone_from(&self.title);
-        self.camera.clear();
-        jpeg::encode(frame.picture, &mut self.camera)?;
-        let mut excited = Vec::new();
+        self.camera_jpeg.clear();
+        jpeg::encode(frame.picture, &mut self.camera_jpeg)?;
+        let mut saliency_jpeg = Vec::new();
         if let Some((pilot, saliency)) = &mut self.saliency {
             saliency.steer(pilot, HEIGHT, WIDTH, &frame.picture.pixels)?;
             self.image.pixels.copy_from_slice(&frame.picture.pixels);
             saliency.overlay(&pilot.recipe().preprocessing, &mut self.image);
-            excited = self.image.to_jpeg();
+            saliency_jpeg = self.image.to_jpeg();
         }
-        self.live.publish(&state, &self.camera, &excited);
+        self.live.publish(&state, &self.camera_jpeg, &saliency_jpeg);
         Ok(())
     }
 }

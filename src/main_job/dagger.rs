@@ -5,8 +5,10 @@ use std::path::{Path, PathBuf};
 use super::training_set::{Take, record_takes};
 use crate::error::Result;
 use crate::files::new_folder::NewFolder;
+use crate::observer::{Observer, Progress};
 use crate::pilot::Pilot;
-use crate::simulator::recorder::record::{drive_and_label, write_recording};
+use crate::simulator::recorder::expert_drive::drive_and_label;
+use crate::simulator::recorder::record::write_recording;
 
 /// What the model drives of each take of the training set.
 const LAPS: f64 = 0.5;
@@ -34,15 +36,15 @@ pub fn recordings(
     takes: &[Take],
     out: &Path,
     round: u32,
-    progress: &(dyn Fn(f64) -> bool + Sync),
+    observer: &mut (dyn Observer<Progress> + Send),
 ) -> Result<Vec<PathBuf>> {
     let takes = takes_of_round(takes, round);
     if !out.exists() {
         let new = NewFolder::create(out)?;
-        let recorded = record_takes(&takes, new.unfinished(), progress, |track, take, folder, progress| {
+        let recorded = record_takes(&takes, new.unfinished(), observer, |track, take, folder, observer| {
             let options = take.options();
             let samples = drive_and_label(track, &options, &mut pilot.clone(), expert_share(round))?;
-            write_recording(track, &options, &samples, folder, progress).map(drop)
+            write_recording(track, &options, &samples, folder, observer).map(drop)
         });
         recorded.map_err(|error| new.explain(error))?;
         new.finish()?;

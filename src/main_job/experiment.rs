@@ -2,21 +2,21 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::AtomicBool;
 
 use serde::Serialize;
 use serde_json::Value;
 
-use super::job::{Stages, test_on_tracks};
+use super::job::{JobEvent, test_on_tracks};
 use super::{TrackResult, training_set};
 use crate::dataset::colour::Colour;
 use crate::dataset::split::SplitMode;
 use crate::error::{Error, Result};
 use crate::files::atomic_file;
+use crate::observer::{Observer, StopSignal};
 use crate::pilot::Pilot;
 use crate::recipe::Recipe;
 use crate::simulator::DriveOptions;
-use crate::training::{self, Observer, TrainRequest};
+use crate::training::{self, TrainRequest};
 
 /// What is varied.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -76,7 +76,7 @@ pub struct Plan {
 
 /// One training and its drives; a line of the CSV.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Trial {
+pub struct ExperimentRow {
     /// What was varied: a split mode or a colour space.
     pub variant: String,
     /// Seed of split, weights and order.
@@ -101,6 +101,15 @@ pub struct Trial {
     pub trained_on_held_out: Vec<String>,
 }
 
+/// What happens in an experiment.
+#[derive(Clone, Debug, PartialEq)]
+pub enum ExperimentEvent {
+    /// Something happens in the training or the drives of a trial.
+    Job(JobEvent),
+    /// A trial is done.
+    Row(ExperimentRow),
+}
+
 /// Recordings of the main job's set that an experiment trains on: both training tracks, and of the random tracks as many
 /// as `random_tracks`.
 pub fn takes(random_tracks: usize) -> Vec<training_set::Take> {
@@ -113,26 +122,23 @@ pub fn takes(random_tracks: usize) -> Vec<training_set::Take> {
     takes
 }
 
-/// Trains and drives every variant of `plan` with every seed. `told` hears of each trial when it is done. Call it inside a
-/// rayon pool; runs are kept in a temporary folder only.
+/// Trains and drives every variant of `plan` with every seed. Call it inside a rayon pool; runs are kept in a temporary folder only.
 ///
 /// # Errors
 ///
-/// As [`training::train`] and [`test_on_tracks`]; [`Error::Interrupted`] if `stop` is set.
+/// As [`training::train`] and [`test_on_tracks`]; [`Error::Interrupted`] if `stop` is requested.
 pub fn run(
     plan: &Plan,
-    observer: &mut (dyn Observer + Send),
-    stages: &dyn Stages,
-    stop: &AtomicBool,
-    told: &mut (dyn FnMut(&Trial) -> Result<()> + Send),
-) -> Result<Vec<Trial>> {
+    observer: &mut (dyn Observer<ExperimentEvent> + Send),
+    stop: &StopSignal,
+) -> Result<Vec<ExperimentRow>> {
     let folder = tempfile::tempdir().map_err(Error::io(std::env::temp_dir()))?;
     let mut trials = Vec::new();
     for (variant, recipe) in plan.subject.variants(&plan.recipe) {
         // Not every colour space fits every network; say so before minutes are spent.
         recipe.network(steersman_kernels::Isa::best())?;
         for seed in 1..=plan.seeds {
-            stages.notice(&format!("{variant}, seed {seed}"));
+            observer.observe(ExperimentEvent::Job(JobEvent::Notice(format!("{variant}, seed {seed}"))))?;
             let request = TrainRequest {
                 recordings: plan.recordings.clone(),
                 recipe: recipe.clone(),
@@ -140,13 +146,16 @@ pub fn run(
                 seed,
                 cache_mib: plan.cache_mib,
                 from: None,
+                profile: false,
+                algorithm: None,
             };
-            let training = training::train(request, observer, stop)?;
+            let mut of_job = |event| observer.observe(ExperimentEvent::Job(event));
+            let training = training::train(request, &mut |event| of_job(JobEvent::Training(event)), stop)?;
             let options = DriveOptions { runs: plan.runs, ..Default::default() };
             let pilot = Pilot::load(&training.model)?;
-            let drives = test_on_tracks(&pilot, &plan.tracks, &options, None, stages, stop)?;
+            let drives = test_on_tracks(&pilot, &plan.tracks, &options, None, &mut of_job, stop)?;
             let mean = |of: &dyn Fn(&TrackResult) -> f64| drives.iter().map(of).sum::<f64>() / drives.len() as f64;
-            let trial = Trial {
+            let trial = ExperimentRow {
                 variant: variant.into(),
                 seed,
                 leak_percent: training.leak_percent,
@@ -159,7 +168,7 @@ pub fn run(
                 cte_mean_m: mean(&|d| d.drive.cte_mean_m),
                 trained_on_held_out: training.trained_on_held_out,
             };
-            told(&trial)?;
+            observer.observe(ExperimentEvent::Row(trial.clone()))?;
             trials.push(trial);
         }
     }
@@ -171,7 +180,7 @@ pub fn run(
 /// # Errors
 ///
 /// [`Error::Io`].
-pub fn write_csv(path: &Path, trials: &[Trial]) -> Result<()> {
+pub fn write_csv(path: &Path, trials: &[ExperimentRow]) -> Result<()> {
     let mut writer = csv::Writer::from_writer(Vec::new());
     for (at, trial) in trials.iter().enumerate() {
         // A record of CSV cannot hold a list, so it is made from the JSON.
@@ -220,7 +229,7 @@ mod tests {
 
     #[test]
     fn the_csv_has_every_field_and_tells_held_out_tracks() {
-        let trial = Trial {
+        let trial = ExperimentRow {
             variant: "blocks".into(),
             seed: 3,
             leak_percent: 12.5,
@@ -235,7 +244,7 @@ mod tests {
         };
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("trials.csv");
-        write_csv(&path, &[trial.clone(), Trial { trained_on_held_out: Vec::new(), ..trial }]).unwrap();
+        write_csv(&path, &[trial.clone(), ExperimentRow { trained_on_held_out: Vec::new(), ..trial }]).unwrap();
         let text = std::fs::read_to_string(&path).unwrap();
         let expected = "variant,seed,leak_percent,val_center_mse,val_mae_deg,fresh_mae_deg,laps_completed,laps_total,\
                         autonomy_percent,cte_mean_m,trained_on_held_out\n\

@@ -1,20 +1,21 @@
 //! The main job from first to last: record the expert, train, let the model drive and learn from that (DAgger), test.
 
 use std::path::{Path, PathBuf};
-use std::sync::Mutex;
-use std::sync::atomic::{AtomicBool, Ordering};
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
+use steersman_kernels::conv::ConvAlgorithm;
 
 use super::training_set::{self, Take};
 use super::{MainJobResult, TRACKS, TrackResult, dagger, test_on_track};
+
 use crate::error::{Error, Result};
 use crate::files::atomic_file;
+use crate::observer::{Observer, Parts, Progress, StopSignal};
 use crate::pilot::Pilot;
 use crate::recipe::Recipe;
 use crate::simulator::{DriveOptions, Track};
-use crate::training::{self, Observer, RunFolder, TrainRequest, TrainResult, TransferRequest};
+use crate::training::{self, RunFolder, TrainRequest, TrainResult, TrainingEvent, TransferRequest};
 
 /// Where the main job keeps what it records.
 pub const RECORDINGS: &str = "data/recordings";
@@ -57,12 +58,38 @@ fn write_json(path: &Path, value: &impl Serialize) -> Result<()> {
     atomic_file::write(path, (text + "\n").as_bytes())
 }
 
-/// Whoever watches the parts of the job that know the share they have done.
-pub trait Stages: Sync {
-    /// A part begins; the answer is told the share that is done.
-    fn begin(&self, what: &str) -> Box<dyn Fn(f64) + Sync>;
+/// What happens in a main job.
+#[derive(Clone, Debug, PartialEq)]
+pub enum JobEvent {
     /// Something the user should know.
-    fn notice(&self, text: &str);
+    Notice(String),
+    /// Recording or driving begins: its [`JobEvent::Progress`] follows, then [`JobEvent::End`].
+    Begin {
+        /// What begins, as in `recording the expert`.
+        what: String,
+    },
+    /// A share of what has begun is done.
+    Progress(Progress),
+    /// What had begun has ended, well or not.
+    End,
+    /// Something happens in a training run.
+    Training(TrainingEvent),
+}
+
+/// Runs `work` between [`JobEvent::Begin`] and [`JobEvent::End`]. Its progress goes to `observer`, and `stop` ends it.
+fn observed<T>(
+    what: String,
+    observer: &mut (dyn Observer<JobEvent> + Send),
+    stop: &StopSignal,
+    work: impl FnOnce(&mut (dyn Observer<Progress> + Send)) -> Result<T>,
+) -> Result<T> {
+    observer.observe(JobEvent::Begin { what })?;
+    let result = work(&mut |progress| {
+        observer.observe(JobEvent::Progress(progress))?;
+        stop.check()
+    });
+    let ended = observer.observe(JobEvent::End);
+    result.and_then(|value| ended.map(|()| value))
 }
 
 /// Where a job records what, and where it drives.
@@ -87,9 +114,9 @@ impl Default for Scope {
 pub struct Job<'a> {
     scope: Scope,
     note: JobNote,
-    observer: &'a mut (dyn Observer + Send),
-    stages: &'a dyn Stages,
-    stop: &'a AtomicBool,
+    observer: &'a mut (dyn Observer<JobEvent> + Send),
+    stop: &'a StopSignal,
+    profile: bool,
     folder: Option<PathBuf>,
 }
 
@@ -106,6 +133,8 @@ pub struct JobRequest {
     pub cache_mib: usize,
     /// Weights to begin the first training with; rounds of DAgger begin anew.
     pub from: Option<TransferRequest>,
+    /// As in [`TrainRequest::algorithm`].
+    pub algorithm: Option<ConvAlgorithm>,
 }
 
 impl<'a> Job<'a> {
@@ -113,11 +142,15 @@ impl<'a> Job<'a> {
     pub fn new(
         scope: Scope,
         note: JobNote,
-        observer: &'a mut (dyn Observer + Send),
-        stages: &'a dyn Stages,
-        stop: &'a AtomicBool,
+        observer: &'a mut (dyn Observer<JobEvent> + Send),
+        stop: &'a StopSignal,
     ) -> Job<'a> {
-        Job { scope, note, observer, stages, stop, folder: None }
+        Job { scope, note, observer, stop, profile: false, folder: None }
+    }
+
+    /// The same job; with `profile` the results of its training say where the time went.
+    pub fn with_profile(self, profile: bool) -> Job<'a> {
+        Job { profile, ..self }
     }
 
     /// The run folder that `train --resume` takes after a stop; `None` as long as nothing was trained.
@@ -131,13 +164,15 @@ impl<'a> Job<'a> {
     ///
     /// As [`training_set::recordings`], [`training::train`] and [`test_on_track`]; [`Error::Interrupted`] after a stop.
     pub fn begin(&mut self, request: JobRequest) -> Result<MainJobResult> {
-        let JobRequest { recipe, out, seed, cache_mib, from } = request;
+        let JobRequest { recipe, out, seed, cache_mib, from, algorithm } = request;
         RunFolder::require_free(&out)?;
         for round in 1..=self.note.dagger_rounds {
             RunFolder::require_free(&dagger_folder(&out, 0, round)?)?;
         }
-        let recordings = training_set(&self.scope.recordings, &self.scope.takes, self.stages, self.stop)?;
-        let training = self.train(TrainRequest { recordings, recipe, out, seed, cache_mib, from })?;
+        let recordings = training_set(&self.scope.recordings, &self.scope.takes, self.observer, self.stop)?;
+        let profile = self.profile;
+        let training =
+            self.train(TrainRequest { recordings, recipe, out, seed, cache_mib, from, profile, algorithm })?;
         self.rest(training)
     }
 
@@ -148,7 +183,7 @@ impl<'a> Job<'a> {
     /// As [`Job::begin`] and [`training::resume`].
     pub fn go_on(&mut self, folder: &Path) -> Result<MainJobResult> {
         self.folder = Some(folder.to_path_buf());
-        let training = training::resume(folder, self.observer, self.stop)?;
+        let training = self.resume(folder)?;
         self.rest(training)
     }
 
@@ -168,12 +203,17 @@ impl<'a> Job<'a> {
         RunFolder::require_free(&request.out)?;
         self.note.write(&request.out)?;
         let out = request.out.clone();
-        let result = training::train(request, self.observer, self.stop);
+        let result = training::train(request, &mut |event| self.observer.observe(JobEvent::Training(event)), self.stop);
         // Before `run.json` is there this run cannot be resumed, but the one before it can.
         if RunFolder::open(&out).is_ok() {
             self.folder = Some(out);
         }
         result
+    }
+
+    fn resume(&mut self, folder: &Path) -> Result<TrainResult> {
+        let mut observer = |event| self.observer.observe(JobEvent::Training(event));
+        training::resume(folder, self.profile, &mut observer, self.stop)
     }
 
     /// The model drives, the expert labels; then training begins anew on all there is.
@@ -184,22 +224,20 @@ impl<'a> Job<'a> {
         let folder = RunFolder::open(&path)?;
         let (info, recipe) = (folder.info()?, folder.recipe()?);
         let pilot = Pilot::load(&training.model)?;
-        let recorded = {
-            let told = self.stages.begin(&format!("the model drives, the expert labels (round {round})"));
-            let progress = |share| {
-                told(share);
-                !self.stop.load(Ordering::Relaxed)
-            };
-            dagger::recordings(&pilot, &self.scope.takes, &path.join("dagger"), round, &progress)?
-        };
+        let (what, takes) = (format!("the model drives, the expert labels (round {round})"), &self.scope.takes);
+        let recorded = observed(what, self.observer, self.stop, |observer| {
+            dagger::recordings(&pilot, takes, &path.join("dagger"), round, observer)
+        })?;
+        let algorithm = Some(info.conv_algorithm(&folder)?);
         let mut recordings = info.recordings;
         recordings.extend(recorded);
         self.note.round = round;
         if self.is_own(&out, &recordings, info.seed)? {
             self.folder = Some(out.clone());
-            return training::resume(&out, self.observer, self.stop);
+            return self.resume(&out);
         }
-        self.train(TrainRequest { recordings, recipe, out, seed: info.seed, cache_mib: info.cache_mib, from: None })
+        let (seed, cache_mib, profile) = (info.seed, info.cache_mib, self.profile);
+        self.train(TrainRequest { recordings, recipe, out, seed, cache_mib, from: None, profile, algorithm })
     }
 
     /// Whether `out` holds the run of this job's round on `recordings` already, begun before a stop.
@@ -213,11 +251,11 @@ impl<'a> Job<'a> {
     }
 
     /// Drives `model` on every track of the job.
-    fn drives(&self, model: &Path) -> Result<Vec<TrackResult>> {
+    fn drives(&mut self, model: &Path) -> Result<Vec<TrackResult>> {
         let pilot = Pilot::load(model)?;
         let options = DriveOptions { runs: self.note.runs, ..Default::default() };
         let keep = self.folder.as_ref().map(|folder| folder.join("drives"));
-        test_on_tracks(&pilot, &self.scope.tracks, &options, keep.as_deref(), self.stages, self.stop)
+        test_on_tracks(&pilot, &self.scope.tracks, &options, keep.as_deref(), self.observer, self.stop)
     }
 }
 
@@ -226,28 +264,23 @@ impl<'a> Job<'a> {
 ///
 /// # Errors
 ///
-/// As [`test_on_track`]; [`Error::Interrupted`] if `stop` is set.
+/// As [`test_on_track`]; [`Error::Interrupted`] if `stop` is requested.
 pub fn test_on_tracks<T: AsRef<str> + Sync>(
     pilot: &Pilot,
     tracks: &[T],
     options: &DriveOptions,
     keep: Option<&Path>,
-    stages: &dyn Stages,
-    stop: &AtomicBool,
+    observer: &mut (dyn Observer<JobEvent> + Send),
+    stop: &StopSignal,
 ) -> Result<Vec<TrackResult>> {
-    let told = stages.begin(&format!("driving on {} tracks", tracks.len()));
-    let shares = Mutex::new(vec![0.0; tracks.len()]);
-    let on_track = |(number, name): (usize, &T)| {
-        let track = Track::load(name.as_ref())?;
-        let progress = |share| {
-            let mut shares = shares.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
-            shares[number] = share;
-            told(shares.iter().sum::<f64>() / shares.len() as f64);
-            !stop.load(Ordering::Relaxed)
+    observed(format!("driving on {} tracks", tracks.len()), observer, stop, |observer| {
+        let parts = Parts::new(vec![1.0; tracks.len()], observer);
+        let on_track = |(number, name): (usize, &T)| {
+            let track = Track::load(name.as_ref())?;
+            test_on_track(pilot, &track, options, keep, &mut parts.part(number))
         };
-        test_on_track(pilot, &track, options, keep, &progress)
-    };
-    tracks.par_iter().enumerate().map(on_track).collect()
+        tracks.par_iter().enumerate().map(on_track).collect()
+    })
 }
 
 /// The recordings of `takes` under `folder`, recorded now if they are not there.
@@ -255,17 +288,18 @@ pub fn test_on_tracks<T: AsRef<str> + Sync>(
 /// # Errors
 ///
 /// As [`training_set::recordings`].
-pub fn training_set(folder: &Path, takes: &[Take], stages: &dyn Stages, stop: &AtomicBool) -> Result<Vec<PathBuf>> {
-    let (paths, reused) = {
-        let told = stages.begin("recording the expert");
-        let progress = |share| {
-            told(share);
-            !stop.load(Ordering::Relaxed)
-        };
-        training_set::recordings(folder, takes, &progress)?
-    };
+pub fn training_set(
+    folder: &Path,
+    takes: &[Take],
+    observer: &mut (dyn Observer<JobEvent> + Send),
+    stop: &StopSignal,
+) -> Result<Vec<PathBuf>> {
+    let (paths, reused) = observed("recording the expert".into(), observer, stop, |observer| {
+        training_set::recordings(folder, takes, observer)
+    })?;
     let verb = if reused { "found" } else { "recorded" };
-    stages.notice(&format!("{verb} the training set of {} recordings under {}", paths.len(), folder.display()));
+    let notice = format!("{verb} the training set of {} recordings under {}", paths.len(), folder.display());
+    observer.observe(JobEvent::Notice(notice))?;
     Ok(paths)
 }
 

@@ -11,12 +11,13 @@ use serde::Serialize;
 
 use crate::error::{Error, Result};
 use crate::files::new_folder::NewFolder;
+use crate::observer::{Observer, Progress};
 use crate::pilot::Pilot;
-use crate::report::map;
-use crate::simulator::camera::eye::Eye;
-use crate::simulator::recorder::record::drive_expert;
+use crate::report::charts::map;
+use crate::simulator::camera::front_camera::FrontCamera;
+use crate::simulator::recorder::expert_drive::drive_expert;
 use crate::simulator::trial::drive::drive;
-use crate::simulator::trial::drive::write_trajectories;
+use crate::simulator::trial::trajectory::write_trajectories;
 use crate::simulator::{DriveOptions, DriveSummary, Driver, HEIGHT, RecordOptions, Track, WIDTH};
 use crate::training::TrainResult;
 
@@ -55,8 +56,8 @@ pub struct MainJobResult {
     pub drives: Vec<TrackResult>,
 }
 
-/// Puts `pilot` to the test on `track`. Call it inside a rayon pool; `progress` is told the share of the runs that are done
-/// and may return `false` to stop. The trajectories are saved in a folder below `keep`, if one is named; what lies there
+/// Puts `pilot` to the test on `track`. Call it inside a rayon pool; `observer` is told the share of the runs that are
+/// done. The trajectories are saved in a folder below `keep`, if one is named; what lies there
 /// already from this test before a stop is left.
 ///
 /// # Errors
@@ -67,11 +68,11 @@ pub fn test_on_track(
     track: &Track,
     options: &DriveOptions,
     keep: Option<&Path>,
-    progress: &(dyn Fn(f64) -> bool + Sync),
+    observer: &mut (dyn Observer<Progress> + Send),
 ) -> Result<TrackResult> {
     let new_driver = || -> Result<Box<dyn Driver>> { Ok(Box::new(pilot.clone())) };
     let offline_mae_deg = offline_mae_deg(pilot, track, options.seed)?;
-    let mut drive = drive(track, new_driver, options, progress)?;
+    let mut drive = drive(track, new_driver, options, observer)?;
     drive.summary.trained_on_held_out = pilot.trained_on_held_out().to_vec();
     // Names of random tracks have a colon, which no file's name has everywhere.
     let folder =
@@ -92,7 +93,7 @@ pub fn test_on_track(
 /// [`Error::Codec`] if a picture cannot be encoded.
 pub fn offline_mae_deg(pilot: &Pilot, track: &Track, seed: u64) -> Result<f64> {
     let samples = drive_expert(track, &RecordOptions { seed, ..Default::default() });
-    let (mut pilot, mut eye) = (pilot.clone(), Eye::new(track, seed));
+    let (mut pilot, mut eye) = (pilot.clone(), FrontCamera::new(track, seed));
     if samples.is_empty() {
         return Err(Error::Data {
             place: track.name().into(),

@@ -1,7 +1,6 @@
 //! What the main job trains on: drives of the expert on training tracks, recorded once and used again.
 
 use std::path::{Path, PathBuf};
-use std::sync::Mutex;
 
 use rayon::prelude::*;
 use serde::Serialize;
@@ -9,6 +8,7 @@ use sha2::{Digest, Sha256};
 
 use crate::error::{Error, Result};
 use crate::files::new_folder::NewFolder;
+use crate::observer::{Observer, Parts, Progress};
 use crate::simulator::{RecordOptions, Track, record};
 
 /// Random tracks in the set. Variety of looks teaches more than laps: each is driven for a fraction of a lap.
@@ -109,16 +109,16 @@ fn digits(hash: Sha256) -> String {
 /// they were.
 ///
 /// A set lies in a folder named after a hash of its settings. It is written under another name and renamed when it is
-/// complete, so a set that is there is whole. `progress` is told the share that is recorded and may return `false` to stop.
+/// complete, so a set that is there is whole. `observer` is told the share that is recorded.
 ///
 /// # Errors
 ///
-/// [`Error::Io`] if something cannot be written, [`Error::Data`] if recordings were taken out of a set,
-/// [`Error::Interrupted`] if `progress` stopped it; nothing is left behind then.
+/// [`Error::Io`] if something cannot be written, [`Error::Data`] if recordings were taken out of a set, and the observer's
+/// own; nothing is left behind then.
 pub fn recordings(
     folder: &Path,
     takes: &[Take],
-    progress: &(dyn Fn(f64) -> bool + Sync),
+    observer: &mut (dyn Observer<Progress> + Send),
 ) -> Result<(Vec<PathBuf>, bool)> {
     let settings = settings(takes)?;
     let set = folder.join(format!("set-{}", digits(Sha256::new_with_prefix(&settings))));
@@ -132,8 +132,8 @@ pub fn recordings(
         return Ok((paths, true));
     }
     let new = NewFolder::create(&set)?;
-    let recorded = record_takes(takes, new.unfinished(), progress, |track, take, folder, progress| {
-        record(track, &take.options(), folder, progress).map(drop)
+    let recorded = record_takes(takes, new.unfinished(), observer, |track, take, folder, observer| {
+        record(track, &take.options(), folder, observer).map(drop)
     });
     recorded.map_err(|error| new.explain(error))?;
     let side = new.unfinished().join("set.toml");
@@ -142,8 +142,8 @@ pub fn recordings(
     Ok((paths, false))
 }
 
-/// Records `takes` into folders of their own under `folder`, each by `how` (track, take, its folder, progress), tracks in
-/// parallel. `progress` is told the share that is recorded and may return `false` to stop.
+/// Records `takes` into folders of their own under `folder`, each by `how` (track, take, its folder, its observer), tracks
+/// in parallel. `observer` is told the share of all that is recorded.
 ///
 /// # Errors
 ///
@@ -151,11 +151,10 @@ pub fn recordings(
 pub(super) fn record_takes(
     takes: &[Take],
     folder: &Path,
-    progress: &(dyn Fn(f64) -> bool + Sync),
-    how: impl Fn(&Track, &Take, &Path, &(dyn Fn(f64) -> bool + Sync)) -> Result<()> + Sync,
+    observer: &mut (dyn Observer<Progress> + Send),
+    how: impl Fn(&Track, &Take, &Path, &mut (dyn Observer<Progress> + Send)) -> Result<()> + Sync,
 ) -> Result<()> {
-    let shares = Mutex::new(vec![0.0; takes.len()]);
-    let in_all: f64 = takes.iter().map(|take| take.laps).sum();
+    let parts = Parts::new(takes.iter().map(|take| take.laps).collect(), observer);
     let numbered: Vec<(usize, &Take)> = takes.iter().enumerate().collect();
     let of_tracks: Vec<_> = numbered.chunk_by(|(_, a), (_, b)| a.track == b.track).collect();
     of_tracks.into_par_iter().try_for_each(|group| {
@@ -163,21 +162,17 @@ pub(super) fn record_takes(
         if track.held_out() {
             return Err(Error::Usage(format!("{} is held out; the training set must not have it", track.name())));
         }
-        group.iter().try_for_each(|&(number, take)| {
-            let of_take = |share| {
-                let mut shares = shares.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
-                shares[number] = f64::max(shares[number], share * take.laps);
-                progress(shares.iter().sum::<f64>() / in_all)
-            };
-            how(&track, take, &folder.join(take.folder()), &of_take)
-        })
+        group
+            .iter()
+            .try_for_each(|&(number, take)| how(&track, take, &folder.join(take.folder()), &mut parts.part(number)))
     })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::simulator::recorder::record::drive_expert;
+    use crate::observer::Unobserved;
+    use crate::simulator::recorder::expert_drive::drive_expert;
     use crate::simulator::{Camera, Mount, Renderer, RgbFrame, Variant};
 
     #[test]
@@ -230,23 +225,23 @@ mod tests {
     #[test]
     fn a_set_is_recorded_once_and_one_that_lacks_something_is_an_error() {
         let folder = tempfile::tempdir().unwrap();
-        let (paths, reused) = recordings(folder.path(), &few(), &|_| true).unwrap();
+        let (paths, reused) = recordings(folder.path(), &few(), &mut Unobserved).unwrap();
         assert!(!reused && paths.len() == 3 && paths.iter().all(|path| path.join("driving_log.csv").is_file()));
-        let again = recordings(folder.path(), &few(), &|_| panic!("nothing is to be recorded")).unwrap();
+        let again = recordings(folder.path(), &few(), &mut |_| panic!("nothing is to be recorded")).unwrap();
         assert_eq!(again, (paths.clone(), true));
         let other: Vec<Take> = few().into_iter().map(|take| Take { seed: take.seed + 10, ..take }).collect();
-        assert!(recordings(folder.path(), &other, &|_| true).unwrap().0[0] != paths[0]);
+        assert!(recordings(folder.path(), &other, &mut Unobserved).unwrap().0[0] != paths[0]);
         std::fs::remove_file(paths[1].join("recording.toml")).unwrap();
-        let error = recordings(folder.path(), &few(), &|_| true).unwrap_err().to_string();
+        let error = recordings(folder.path(), &few(), &mut Unobserved).unwrap_err().to_string();
         assert!(error.contains("recorded again"), "{error}");
     }
 
     #[test]
     fn what_is_stopped_or_refused_leaves_nothing_behind() {
         let folder = tempfile::tempdir().unwrap();
-        assert!(matches!(recordings(folder.path(), &few(), &|_| false), Err(Error::Interrupted)));
+        assert!(matches!(recordings(folder.path(), &few(), &mut |_| Err(Error::Interrupted)), Err(Error::Interrupted)));
         let held_out = vec![Take { track: "coast".into(), ..few()[0].clone() }];
-        assert!(recordings(folder.path(), &held_out, &|_| true).unwrap_err().to_string().contains("held out"));
+        assert!(recordings(folder.path(), &held_out, &mut Unobserved).unwrap_err().to_string().contains("held out"));
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
     }
 }

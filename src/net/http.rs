@@ -1,25 +1,23 @@
-//! The little of HTTP that the servers of this program speak: one request, one answer, or a WebSocket from there on.
+//! The part of HTTP that the servers of this program need: one request and one response, or a WebSocket after the request.
 //!
-//! `httparse` reads requests and `tungstenite` speaks WebSocket; a server that owns its sockets can bound every wait and end
-//! when it is told to, which the small HTTP servers there are do not allow once a connection has become a WebSocket.
+//! `httparse` reads requests and `tungstenite` speaks WebSocket. The servers own their sockets, so they can bound every wait
+//! and stop at once. Small HTTP server libraries do not allow that for a connection that has become a WebSocket.
 
 use std::borrow::Cow;
 use std::io::ErrorKind;
 use std::net::{IpAddr, SocketAddr, TcpListener};
 
-use tungstenite::handshake::derive_accept_key;
-
 use crate::error::{Error, Result};
 
-/// Longest request, bytes.
-pub(crate) const MAX_HEAD: usize = 8 * 1024;
-/// Most headers of a request.
+/// Longest head of a request, bytes.
+pub(crate) const MAX_HEAD_LEN: usize = 8 * 1024;
+/// Largest number of headers of a request.
 pub(crate) const MAX_HEADERS: usize = 64;
 
 /// A request without a body.
 #[derive(Clone, Debug)]
 pub(crate) struct Head<'a> {
-    /// Bytes of the request.
+    /// Length of the request, bytes.
     pub len: usize,
     pub method: &'a str,
     /// Path and query.
@@ -27,7 +25,7 @@ pub(crate) struct Head<'a> {
     headers: Vec<(&'a str, &'a [u8])>,
 }
 
-/// What is no request.
+/// Why bytes are no request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum BadHead {
     /// It has not ended within 8 KiB.
@@ -37,7 +35,7 @@ pub(crate) enum BadHead {
 }
 
 impl<'a> Head<'a> {
-    /// Reads what has come of a request; `None` while it goes on.
+    /// Reads the part of a request that has arrived; `None` while it is incomplete.
     pub fn parse(bytes: &'a [u8]) -> Result<Option<Head<'a>>, BadHead> {
         let mut headers = [httparse::EMPTY_HEADER; MAX_HEADERS];
         let mut request = httparse::Request::new(&mut headers);
@@ -48,7 +46,7 @@ impl<'a> Head<'a> {
                 target: request.path.unwrap_or("/"),
                 headers: request.headers.iter().map(|header| (header.name, header.value)).collect(),
             })),
-            Ok(httparse::Status::Partial) if bytes.len() < MAX_HEAD => Ok(None),
+            Ok(httparse::Status::Partial) if bytes.len() < MAX_HEAD_LEN => Ok(None),
             Ok(httparse::Status::Partial) => Err(BadHead::TooLong),
             Err(_) => Err(BadHead::NotHttp),
         }
@@ -58,52 +56,29 @@ impl<'a> Head<'a> {
         self.headers.iter().find(|(known, _)| known.eq_ignore_ascii_case(name)).map(|(_, value)| *value)
     }
 
-    /// A header that is text.
+    /// The value of a header, if it is text.
     pub fn header(&self, name: &str) -> Option<&'a str> {
         self.bytes(name).and_then(|value| std::str::from_utf8(value).ok()).map(str::trim)
     }
 
-    /// The page that asks, if one does. One that is no text is still the origin of a page.
+    /// The origin of the page that asks, if a page does. An origin that is no text still belongs to a page.
     pub fn origin(&self) -> Option<Cow<'a, str>> {
         self.bytes("origin").map(String::from_utf8_lossy)
     }
-
-    /// Whether the request is to become a WebSocket.
-    pub fn wants_websocket(&self) -> bool {
-        let has_token = |name: &str, token: &str| {
-            self.header(name).is_some_and(|value| value.split(',').any(|part| part.trim().eq_ignore_ascii_case(token)))
-        };
-        has_token("upgrade", "websocket") && has_token("connection", "upgrade")
-    }
-
-    /// The answer after which a WebSocket begins, without extension or subprotocol; or the status and the sentence of a
-    /// refusal.
-    pub fn accept_websocket(&self) -> Result<String, (&'static str, &'static str)> {
-        if self.header("sec-websocket-version") != Some("13") {
-            return Err(("426 Upgrade Required\r\nSec-WebSocket-Version: 13", "version 13 of WebSocket is expected"));
-        }
-        let Some(key) = self.header("sec-websocket-key").filter(|key| !key.is_empty()) else {
-            return Err(("400 Bad Request", "the header Sec-WebSocket-Key is missing"));
-        };
-        Ok(format!(
-            "HTTP/1.1 101 Switching Protocols\r\nUpgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Accept: {}\r\n\r\n",
-            derive_accept_key(key.as_bytes())
-        ))
-    }
 }
 
-/// Whether the name in a `Host` header cannot be made to point elsewhere: `localhost` or an address made of digits.
+/// Whether no one can let the name in a `Host` header point elsewhere: it is `localhost` or an address of digits.
 pub(crate) fn is_fixed_name(host: &str) -> bool {
     let name = host.rsplit_once(':').map_or(host, |(name, _)| name);
     name == "localhost" || name.trim_matches(['[', ']']).parse::<IpAddr>().is_ok()
 }
 
-/// A whole answer of one sentence, after which the connection is closed.
+/// A whole response of one sentence, after which the server closes the connection.
 pub(crate) fn plain(status: &str, sentence: &str) -> String {
     response(status, "text/plain; charset=utf-8", "", &format!("{sentence}\n"))
 }
 
-/// A whole answer, after which the connection is closed. `headers` are further ones, each with its line end.
+/// A whole response, after which the server closes the connection. `headers` are further headers, each with its line end.
 pub(crate) fn response(status: &str, content_type: &str, headers: &str, body: &str) -> String {
     let len = body.len();
     format!(
@@ -111,7 +86,7 @@ pub(crate) fn response(status: &str, content_type: &str, headers: &str, body: &s
     )
 }
 
-/// Listens at `address`; accepting does not wait. `in_use` says what to do if another program has the port.
+/// Listens at `address` without blocking. `in_use` is the remedy if another program has the port.
 ///
 /// # Errors
 ///
@@ -153,7 +128,6 @@ mod tests {
         let head = Head::parse(text).unwrap().unwrap();
         assert_eq!((head.method, head.target, head.len), ("GET", "/a?b=c", text.len() - 4));
         assert_eq!((head.header("Host"), head.header("Cookie")), (Some("x"), None));
-        assert!(head.wants_websocket() && head.accept_websocket().unwrap_err().0.starts_with("426"));
         assert_eq!(Head::parse(b"\x16\x03\x01").unwrap_err(), BadHead::NotHttp);
     }
 }

@@ -1,27 +1,9 @@
-//! Measures of how well a model predicts, and pictures of data, networks and runs.
+//! What people look at: charts, pages, explanations of a model, and videos.
 //!
-//! [`svg`], [`chart`], [`html`] and [`picture`] draw; the other modules say what there is to see. Pages stand alone: they open
-//! from disk and load nothing.
+//! [`charts`] draws, [`explain`] asks a model what it looks at, [`pages`] writes HTML pages that open from disk and load
+//! nothing, [`video`] films drives and recordings.
 
-pub mod chart;
-pub mod comparison;
-pub mod counterfactual;
-pub mod explanation;
-pub mod footage;
-pub mod html;
-pub mod inspection;
-mod lettering;
-pub mod map;
-mod metrics;
-pub mod network_diagram;
-pub mod palette;
-pub mod picture;
-pub mod run;
-pub mod saliency;
-pub mod sparkline;
-pub mod split_view;
-pub mod steering;
-pub mod svg;
+pub mod charts;
+pub mod explain;
+pub mod pages;
 pub mod video;
-
-pub use metrics::{Metrics, Prediction, correlation};

@@ -1,12 +1,14 @@
-//! The HTTP request that opens a WebSocket: accepted, or refused with one sentence that names the remedy.
+//! Reads the HTTP request that opens a WebSocket, and accepts it or refuses it with one sentence that names the remedy.
 
-use super::protocol::EngineVersion;
+use crate::net::handshake;
 use crate::net::http::{self, BadHead, Head, is_fixed_name};
+use crate::text::excerpt;
+use crate::udacity::EngineVersion;
 
-/// What is to be done with a client after what it has sent so far.
+/// What to do with a client after what it has sent so far.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Verdict {
-    /// The request goes on.
+    /// Wait for the rest of the request.
     Incomplete,
     /// Send `response`; frames follow after the first `head_len` bytes.
     Accept {
@@ -15,7 +17,7 @@ pub enum Verdict {
         /// Length of the request.
         head_len: usize,
         /// Who connects.
-        client: Client,
+        client: ClientInfo,
     },
     /// Send `response` and close.
     Refuse {
@@ -28,21 +30,21 @@ pub enum Verdict {
 
 /// Who connects.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Client {
+pub struct ClientInfo {
     /// The `User-Agent`, empty if it has none.
     pub agent: String,
     /// Version of Engine.IO that it claims.
     pub version: EngineVersion,
 }
 
-impl Client {
+impl ClientInfo {
     /// Whether this is the WebSocket library of Udacity's simulator, which needs no Engine.IO handshake.
     pub fn is_simulator(&self) -> bool {
         self.agent.starts_with("websocket-sharp")
     }
 }
 
-/// Reads what has come of a request. `allowed_origins` are those of web pages that may connect; `*` is any.
+/// Reads the part of a request that has arrived. Web pages of `allowed_origins` may connect; `*` allows all.
 pub fn examine(head: &[u8], allowed_origins: &[String]) -> Verdict {
     let request = match Head::parse(head) {
         Ok(Some(request)) => request,
@@ -66,7 +68,7 @@ pub fn examine(head: &[u8], allowed_origins: &[String]) -> Verdict {
             "only WebSocket is spoken here: connect with transports=['websocket'] instead of polling",
         );
     }
-    if request.method != "GET" || !request.wants_websocket() {
+    if request.method != "GET" || !handshake::is_requested(&request) {
         return refuse(
             "400 Bad Request",
             "a WebSocket is expected here: start the simulator in autonomous mode, or connect a Socket.IO client with transports=['websocket']",
@@ -78,30 +80,28 @@ pub fn examine(head: &[u8], allowed_origins: &[String]) -> Verdict {
     {
         return refuse(
             "403 Forbidden",
-            &format!("web pages of {} may not connect; --allow-origin allows it", printable(origin)),
+            &format!("web pages of {} may not connect; --allow-origin allows it", excerpt(origin, SHOWN)),
         );
     }
     // No extension and no subprotocol: the simulator closes the connection if it is offered one.
-    let response = match request.accept_websocket() {
+    let response = match handshake::accept(&request) {
         Ok(response) => response,
         Err((status, reason)) => return refuse(status, reason),
     };
     let version = if parameter("EIO") == Some("4") { EngineVersion::V4 } else { EngineVersion::V3 };
-    let agent = printable(request.header("user-agent").unwrap_or(""));
-    Verdict::Accept { response, head_len: request.len, client: Client { agent, version } }
+    let agent = excerpt(request.header("user-agent").unwrap_or(""), SHOWN);
+    Verdict::Accept { response, head_len: request.len, client: ClientInfo { agent, version } }
 }
 
-/// Whether a page of `origin` may connect. Some libraries name the server itself, which no page can do: this server has no
-/// pages, and an address made of digits cannot be redirected to it.
+/// Whether a page of `origin` may connect. Some libraries name the server itself as the origin. No page can do that: this
+/// server has no pages, and no one can make an address of digits point to another machine.
 fn is_allowed(origin: &str, host: &str, allowed: &[String]) -> bool {
     let own = is_fixed_name(host) && origin.strip_prefix("http://") == Some(host);
     own || allowed.iter().any(|allowed| allowed == "*" || allowed.trim_end_matches('/') == origin)
 }
 
-/// The start of a header's value, fit for a log line.
-fn printable(value: &str) -> String {
-    value.chars().filter(|c| !c.is_control()).take(80).collect()
-}
+/// Characters of a header's value that are shown to a person.
+const SHOWN: usize = 80;
 
 fn refuse(status: &str, reason: &str) -> Verdict {
     let response = http::plain(status, reason);
@@ -147,7 +147,7 @@ mod tests {
         for end in 0..SIMULATOR.len() {
             assert_eq!(examine(&SIMULATOR.as_bytes()[..end], &[]), Verdict::Incomplete, "{end}");
         }
-        let endless = format!("GET / HTTP/1.1\r\nX: {}", "x".repeat(http::MAX_HEAD));
+        let endless = format!("GET / HTTP/1.1\r\nX: {}", "x".repeat(http::MAX_HEAD_LEN));
         assert_eq!(refusal(&endless).0, "431");
     }
 

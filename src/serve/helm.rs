@@ -1,16 +1,16 @@
-//! From the model's steering to a command: smoothing, and a speed to hold.
+//! Makes a command from the model's steering: smoothing, and a speed to hold.
 
 use std::time::Instant;
 
-use super::protocol::Command;
 use crate::simulator::car::speed::{SpeedController, slower_in_bends_mph};
+use crate::udacity::Command;
 
 /// How the car is driven.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct HelmOptions {
     /// Speed to hold, mph.
     pub speed_mph: f64,
-    /// Drive slower where much steering is needed.
+    /// Whether to drive slower where the model steers much.
     pub slower_in_bends: bool,
     /// Time constant of the low-pass filter of the steering, s; 0 for none.
     pub smooth_s: f64,
@@ -22,16 +22,16 @@ impl Default for HelmOptions {
     }
 }
 
-/// When a frame was taken.
+/// The time of a frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Clock {
-    /// When it came.
+pub enum FrameTime {
+    /// The server's clock at its arrival.
     Arrival(Instant),
-    /// Simulated seconds, from a client that waits for each answer.
+    /// Simulated time, s, from a client that waits for each answer.
     Simulated(f64),
 }
 
-/// One drive of one client.
+/// Makes the commands of one drive of one client.
 #[derive(Clone, Debug)]
 pub struct Helm {
     options: HelmOptions,
@@ -42,7 +42,7 @@ pub struct Helm {
 }
 
 impl Helm {
-    /// For a drive that begins.
+    /// A helm for a drive that begins now.
     pub fn new(options: HelmOptions) -> Helm {
         Helm {
             options,
@@ -53,14 +53,14 @@ impl Helm {
         }
     }
 
-    /// The command for a frame taken at `clock`, for which the model said `steering`, at `speed_mph`.
+    /// The command for the frame of `time`: the model's output is `steering`, the car drives at `speed_mph`.
     ///
-    /// A model that answers nonsense steers straight ahead. `drive` computes its commands alike, so without smoothing and
-    /// slowing down a client on simulated time is driven to the same bits.
-    pub fn command(&mut self, steering: f32, speed_mph: f64, clock: Clock) -> Command {
-        let time_s = match clock {
-            Clock::Arrival(came) => came.saturating_duration_since(self.began).as_secs_f64(),
-            Clock::Simulated(time_s) => time_s,
+    /// Steering that is not finite becomes 0. `drive` computes its commands in the same way; without smoothing and slowing
+    /// down, a client on simulated time gets the same bits.
+    pub fn command(&mut self, steering: f32, speed_mph: f64, time: FrameTime) -> Command {
+        let time_s = match time {
+            FrameTime::Arrival(arrived) => arrived.saturating_duration_since(self.began).as_secs_f64(),
+            FrameTime::Simulated(time_s) => time_s,
         };
         let mut steering = if steering.is_finite() { steering.clamp(-1.0, 1.0) } else { 0.0 };
         if let Some(last_s) = self.last_s.filter(|_| self.options.smooth_s > 0.0) {
@@ -77,13 +77,13 @@ impl Helm {
         self.last
     }
 
-    /// The command when nothing is known any more: the wheel stays, the throttle is cut.
+    /// The command without a usable frame: the last steering, and no throttle.
     pub fn cut_throttle(&mut self) -> Command {
         self.last.throttle = 0.0;
         self.last
     }
 
-    /// A person drives: what the speed controller has summed up no longer means anything.
+    /// Begins anew after a person drove by hand: the integral of the speed controller has lost its meaning.
     pub fn release(&mut self) {
         *self = Helm::new(self.options);
     }
@@ -95,10 +95,10 @@ mod tests {
     use std::time::Duration;
 
     #[test]
-    fn steering_is_clamped_and_nonsense_is_straight_ahead() {
+    fn steering_is_clamped_and_not_finite_is_straight_ahead() {
         let mut helm = Helm::new(HelmOptions::default());
         for (model, command) in [(0.25, 0.25), (3.0, 1.0), (-3.0, -1.0), (f32::NAN, 0.0), (f32::INFINITY, 0.0)] {
-            assert_eq!(helm.command(model, 15.0, Clock::Simulated(0.0)).steering, command);
+            assert_eq!(helm.command(model, 15.0, FrameTime::Simulated(0.0)).steering, command);
         }
     }
 
@@ -108,12 +108,12 @@ mod tests {
         let mut controller = SpeedController::default();
         for (time_s, mph) in [(0.0, 14.2), (0.06, 14.3), (0.1, 14.4)] {
             let expected = controller.throttle_at(time_s, 15.0, mph);
-            assert_eq!(helm.command(0.0, mph, Clock::Simulated(time_s)).throttle, expected);
+            assert_eq!(helm.command(0.0, mph, FrameTime::Simulated(time_s)).throttle, expected);
         }
         let mut by_arrival = Helm::new(HelmOptions::default());
         let (start, mut controller) = (by_arrival.began, SpeedController::default());
         for (ms, mph) in [(5, 14.2), (65, 14.3)] {
-            let throttle = by_arrival.command(0.0, mph, Clock::Arrival(start + Duration::from_millis(ms))).throttle;
+            let throttle = by_arrival.command(0.0, mph, FrameTime::Arrival(start + Duration::from_millis(ms))).throttle;
             assert!((throttle - controller.throttle_at(ms as f64 / 1e3, 15.0, mph)).abs() < 1e-6);
         }
     }
@@ -122,12 +122,12 @@ mod tests {
     fn smoothing_reaches_a_step_after_some_time_constants_whatever_the_rate() {
         for dt_s in [0.01, 0.05] {
             let mut helm = Helm::new(HelmOptions { smooth_s: 0.1, ..Default::default() });
-            assert_eq!(helm.command(0.0, 15.0, Clock::Simulated(0.0)).steering, 0.0);
+            assert_eq!(helm.command(0.0, 15.0, FrameTime::Simulated(0.0)).steering, 0.0);
             let mut at = 0.0;
             let mut steering = 0.0;
             while at < 0.0999 {
                 at += dt_s;
-                steering = helm.command(1.0, 15.0, Clock::Simulated(at)).steering;
+                steering = helm.command(1.0, 15.0, FrameTime::Simulated(at)).steering;
             }
             assert!((steering - (1.0 - (-1.0_f32).exp())).abs() < 1e-5, "{dt_s}: {steering}");
         }
@@ -135,9 +135,9 @@ mod tests {
 
     #[test]
     fn bends_are_taken_slower_if_wanted_and_the_throttle_can_be_cut() {
-        let plain = Helm::new(HelmOptions::default()).command(0.6, 15.0, Clock::Simulated(0.0));
+        let plain = Helm::new(HelmOptions::default()).command(0.6, 15.0, FrameTime::Simulated(0.0));
         let mut slower = Helm::new(HelmOptions { slower_in_bends: true, ..Default::default() });
-        let command = slower.command(0.6, 15.0, Clock::Simulated(0.0));
+        let command = slower.command(0.6, 15.0, FrameTime::Simulated(0.0));
         assert!(command.throttle < plain.throttle - 0.1 && command.steering == plain.steering);
         assert_eq!(slower.cut_throttle(), Command { throttle: 0.0, ..command });
     }

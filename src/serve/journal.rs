@@ -1,4 +1,4 @@
-//! What is told to the person at the keyboard: what happened, what is wrong, and what to do about it.
+//! Messages for the user: what happened, what is wrong, and what to do about it.
 
 use std::collections::BTreeMap;
 use std::sync::{Mutex, PoisonError};
@@ -6,44 +6,47 @@ use std::time::{Duration, Instant};
 
 use serde::Serialize;
 
-use super::server::Console;
+use super::server_event::ServeEvent;
+use crate::observer::Observer;
+use crate::text::escaped;
+use crate::{Error, Result};
 
-/// Each event may be reported once in this time on average.
+/// Average time between two reports of one kind of incident.
 const INTERVAL: Duration = Duration::from_secs(5);
-/// Reports of one event that may come in a row before that.
+/// Reports of one kind that are shown at once before the limit applies.
 const BURST: u32 = 5;
 
-/// Something that is reported. Each has its own sentence with the remedy, and is repeated only now and then.
+/// A kind of incident. Each has its own sentence with the remedy; a repetition is shown only now and then.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Event {
+pub enum Incident {
     /// A client connected.
     Connected,
     /// A client left.
     Disconnected,
-    /// A client drives from now on.
+    /// A client gets the seat: it is driven from now on.
     Drives,
-    /// Nobody has connected.
+    /// No client has connected.
     NobodyConnects,
     /// A request was refused.
     Refused,
-    /// More connections than are kept.
+    /// There are more connections than the server keeps.
     TooManyConnections,
-    /// A client was too slow.
+    /// A client let a time limit pass.
     TooSlow,
-    /// Bytes that are no WebSocket frames, or frames that are too large.
+    /// Bytes that are no WebSocket frame, or a frame that is too large.
     BrokenFrames,
-    /// A message that is no Socket.IO.
+    /// A message that is no packet of Socket.IO.
     NotSocketIo,
-    /// The browser version's protocol.
+    /// The protocol of the browser version of the simulator.
     PlainJson,
     /// An event with broken JSON.
     BrokenEvent,
-    /// Connected, but no telemetry.
+    /// A client is connected and sends no telemetry.
     NoTelemetry,
-    /// Telemetry of the driven car stopped.
+    /// The driven client stopped sending telemetry.
     Stale,
-    /// Telemetry of a car that is not driven stopped.
+    /// A client that is not driven stopped sending telemetry.
     Silent,
     /// Telemetry without a picture.
     NoImage,
@@ -53,90 +56,96 @@ pub enum Event {
     UnreadableImage,
     /// Another client drives.
     SeatTaken,
-    /// Numbers with another decimal mark than a point.
+    /// A client writes numbers with another decimal mark than a point.
     DecimalMark,
-    /// A simulator of the second term.
+    /// A client is a simulator of the second term.
     SecondTerm,
-    /// A person drives.
+    /// A person drives by hand.
     Override,
-    /// The car ignores the throttle.
+    /// The car does not follow the throttle.
     ThrottleIgnored,
     /// A row could not be recorded in time.
     RecordingLags,
-    /// A namespace other than `/`.
+    /// A client asks for a namespace other than `/`.
     Namespace,
-    /// This program failed.
+    /// This program is at fault.
     Fault,
 }
 
-impl Event {
-    /// What it means and what to do, if anything.
+impl Incident {
+    /// What the user can do, if anything.
     fn remedy(self) -> Option<&'static str> {
         Some(match self {
-            Event::Connected | Event::Disconnected | Event::Drives | Event::Refused => return None,
-            Event::NobodyConnects => {
+            Incident::Connected | Incident::Disconnected | Incident::Drives | Incident::Refused => return None,
+            Incident::NobodyConnects => {
                 "start the simulator on this machine and choose a track in AUTONOMOUS MODE; it connects to port 4567 of \
                  127.0.0.1 by itself. For a simulator on another machine or in a container give --host 0.0.0.0"
             }
-            Event::TooManyConnections => "the oldest that does not drive is closed",
-            Event::TooSlow => "closed; whoever connects has to send telemetry",
-            Event::BrokenFrames => "closed; is this a WebSocket client, and is an image below 700 KB?",
-            Event::NotSocketIo => "a Socket.IO client is expected, such as Udacity's simulator",
-            Event::PlainJson => {
+            Incident::TooManyConnections => "the oldest that does not drive is closed",
+            Incident::TooSlow => "closed; whoever connects has to send telemetry",
+            Incident::BrokenFrames => "closed; is this a WebSocket client, and is an image below 700 KB?",
+            Incident::NotSocketIo => "a Socket.IO client is expected, such as Udacity's simulator",
+            Incident::PlainJson => {
                 "that is the protocol of the browser version of the simulator; use the desktop build, version 2 of 2/07/17 \
                  or later"
             }
-            Event::BrokenEvent => {
+            Incident::BrokenEvent => {
                 "expected is 42[\"telemetry\",{\"steering_angle\":…,\"throttle\":…,\"speed\":…,\"image\":…}]"
             }
-            Event::NoTelemetry => {
+            Incident::NoTelemetry => {
                 "choose AUTONOMOUS MODE (not TRAINING MODE); in the simulator's window no key may be held; builds before \
                  version 2 of 2/07/17 speak another protocol"
             }
-            Event::Stale => {
+            Incident::Stale => {
                 "the throttle is cut and telemetry asked for; is the simulator's window minimised, in a menu, or its machine \
                  overloaded?"
             }
-            Event::Silent => {
+            Incident::Silent => {
                 "it is asked for; is the simulator's window minimised, in a menu, or its machine overloaded?"
             }
-            Event::NoImage => "the throttle is cut; use a simulator with a front camera",
-            Event::NoSpeed => "the throttle is cut; the field `speed` in mph is needed to hold a speed",
-            Event::UnreadableImage => {
+            Incident::NoImage => "the throttle is cut; use a simulator with a front camera",
+            Incident::NoSpeed => "the throttle is cut; the field `speed` in mph is needed to hold a speed",
+            Incident::UnreadableImage => {
                 "the throttle is cut; a JPEG or PNG of at most 1920x1920 pixels in base64 is expected"
             }
-            Event::SeatTaken => "it waits until that one leaves or is silent for more than 1 s",
-            Event::DecimalMark => "commands are written in the same way, no change of the language is needed",
-            Event::SecondTerm => "it gets numbers instead of strings",
-            Event::Override => "release W and S to let the model drive",
-            Event::ThrottleIgnored => {
+            Incident::SeatTaken => "it waits until that one leaves or is silent for more than 1 s",
+            Incident::DecimalMark => "commands are written in the same way, no change of the language is needed",
+            Incident::SecondTerm => "it gets numbers instead of strings",
+            Incident::Override => "release W and S to let the model drive",
+            Incident::ThrottleIgnored => {
                 "is this the car's camera view with no key held? Other programs on port 4567 can answer in between: close them"
             }
-            Event::RecordingLags => "the disk is too slow; frames are left out of the recording",
-            Event::Fault => "please report it with what was sent",
-            Event::Namespace => "connect without a namespace",
+            Incident::RecordingLags => "the disk is too slow; frames are left out of the recording",
+            Incident::Fault => "please report it with what was sent",
+            Incident::Namespace => "connect without a namespace",
         })
     }
 }
 
-/// The log.
+/// The observer, and the error with which it ended the log.
+struct Observed<'a> {
+    observer: &'a mut (dyn Observer<ServeEvent> + Send),
+    error: Option<Error>,
+}
+
+/// The log. It escapes every line, so bytes of a client never reach the terminal raw.
 pub struct Journal<'a> {
-    console: &'a dyn Console,
+    observer: Mutex<Observed<'a>>,
     check: bool,
-    entries: Mutex<BTreeMap<Event, Entry>>,
+    entries: Mutex<BTreeMap<Incident, Entry>>,
 }
 
 #[derive(Debug, Default)]
 struct Entry {
     count: u64,
-    /// Not shown since the last that was.
-    silent: u64,
-    /// When the reports shown so far are used up.
+    /// Reports left out since the last one that was shown.
+    left_out: u64,
+    /// Time until which the reports shown so far use up the limit.
     used_until: Option<Instant>,
 }
 
 impl Entry {
-    /// Whether one more is shown at `now`.
+    /// Counts a report at `now`. Whether it is shown.
     fn admit(&mut self, now: Instant) -> bool {
         self.count += 1;
         let used_until = self.used_until.map_or(now, |until| until.max(now)) + INTERVAL;
@@ -144,55 +153,85 @@ impl Entry {
         if shown {
             self.used_until = Some(used_until);
         } else {
-            self.silent += 1;
+            self.left_out += 1;
         }
         shown
     }
 }
 
 impl<'a> Journal<'a> {
-    /// A log that is shown on `console`; with `check` every step and message as well.
-    pub fn new(console: &'a dyn Console, check: bool) -> Journal<'a> {
-        Journal { console, check, entries: Mutex::default() }
+    /// A log that tells `observer`; with `check` it also tells every step and message.
+    pub fn new(observer: &'a mut (dyn Observer<ServeEvent> + Send), check: bool) -> Journal<'a> {
+        Journal { observer: Mutex::new(Observed { observer, error: None }), check, entries: Mutex::default() }
     }
 
-    /// Reports `event`: `detail`, and the remedy. Not more often than every few seconds for each kind of event.
-    pub fn report(&self, event: Event, detail: std::fmt::Arguments) {
+    fn tell(&self, event: ServeEvent) {
+        let mut observed = self.observer.lock().unwrap_or_else(PoisonError::into_inner);
+        if observed.error.is_none() {
+            observed.error = observed.observer.observe(event).err();
+        }
+    }
+
+    /// Shows the status line.
+    pub fn status(&self, text: String) {
+        self.tell(ServeEvent::Status(text));
+    }
+
+    /// Whether the observer has returned an error. It then gets no more events.
+    pub fn failed(&self) -> bool {
+        self.observer.lock().unwrap_or_else(PoisonError::into_inner).error.is_some()
+    }
+
+    /// Ends the log.
+    ///
+    /// # Errors
+    ///
+    /// The first error of the observer.
+    pub fn into_result(self) -> Result<()> {
+        self.observer.into_inner().unwrap_or_else(PoisonError::into_inner).error.map_or(Ok(()), Err)
+    }
+
+    /// Shows `detail` and the remedy of `incident`, and limits how often it does so for each kind.
+    pub fn report(&self, incident: Incident, detail: std::fmt::Arguments) {
         let now = Instant::now();
-        let silent = {
+        let left_out = {
             let mut entries = self.entries.lock().unwrap_or_else(PoisonError::into_inner);
-            let entry = entries.entry(event).or_default();
+            let entry = entries.entry(incident).or_default();
             if !entry.admit(now) {
                 return;
             }
-            std::mem::take(&mut entry.silent)
+            std::mem::take(&mut entry.left_out)
         };
-        let more = match silent {
+        let more = match left_out {
             0 => String::new(),
             more => format!(" ({more} more like this before)"),
         };
-        match event.remedy() {
-            Some(remedy) => self.console.line(&format!("{detail}: {remedy}{more}")),
-            None => self.console.line(&format!("{detail}{more}")),
+        match incident.remedy() {
+            Some(remedy) => self.line(&format!("{detail}: {remedy}{more}")),
+            None => self.line(&format!("{detail}{more}")),
         }
     }
 
-    /// Shows a step of a connection, if every step is wanted.
+    /// Shows a step of a connection if `check` is on.
     pub fn step(&self, text: std::fmt::Arguments) {
         if self.check {
-            self.console.line(&text.to_string());
+            self.line(&text.to_string());
         }
     }
 
-    /// Whether every step is wanted.
+    fn line(&self, text: &str) {
+        self.tell(ServeEvent::Line(escaped(text).into_owned()));
+    }
+
+    /// Whether `check` is on.
     pub fn checks(&self) -> bool {
         self.check
     }
 
-    /// How often each event happened.
-    pub fn counts(&self) -> BTreeMap<Event, u64> {
+    /// How often each kind of incident happened.
+    pub fn counts(&self) -> BTreeMap<Incident, u64> {
         let entries = self.entries.lock().unwrap_or_else(PoisonError::into_inner);
-        entries.iter().map(|(event, entry)| (*event, entry.count)).collect()
+        entries.iter().map(|(incident, entry)| (*incident, entry.count)).collect()
     }
 }
 
@@ -200,32 +239,59 @@ impl<'a> Journal<'a> {
 mod tests {
     use super::*;
 
-    #[derive(Default)]
-    struct Lines(Mutex<Vec<String>>);
-
-    impl Console for Lines {
-        fn line(&self, text: &str) {
-            self.0.lock().unwrap().push(text.into());
-        }
-
-        fn status(&self, _: &str) {}
+    /// The lines of `work` on a log.
+    fn lines_of(check: bool, work: impl FnOnce(&Journal)) -> Vec<String> {
+        let mut lines = Vec::new();
+        let mut observer = |event| {
+            match event {
+                ServeEvent::Line(text) => lines.push(text),
+                ServeEvent::Status(_) => {}
+            }
+            Ok(())
+        };
+        let journal = Journal::new(&mut observer, check);
+        work(&journal);
+        assert!(!journal.failed() && journal.into_result().is_ok());
+        lines
     }
 
     #[test]
-    fn a_flood_of_one_event_is_a_few_lines_and_hides_no_other() {
-        let lines = Lines::default();
-        let journal = Journal::new(&lines, false);
-        for k in 0..1000 {
-            journal.report(Event::UnreadableImage, format_args!("picture {k}"));
-        }
-        journal.report(Event::NoSpeed, format_args!("telemetry without a speed"));
-        journal.step(format_args!("not shown"));
-        let lines = lines.0.lock().unwrap();
+    fn a_flood_of_one_incident_is_a_few_lines_and_hides_no_other() {
+        let lines = lines_of(false, |journal| {
+            for k in 0..1000 {
+                journal.report(Incident::UnreadableImage, format_args!("picture {k}"));
+            }
+            journal.report(Incident::NoSpeed, format_args!("telemetry without a speed"));
+            journal.step(format_args!("not shown"));
+            assert_eq!(journal.counts()[&Incident::UnreadableImage], 1000);
+        });
         assert_eq!(lines.len(), BURST as usize + 1, "{lines:?}");
+        assert!(lines[0].starts_with("picture 0: "), "{lines:?}");
         let (mut entry, now) = (Entry::default(), Instant::now());
         let shown = (0..6000).filter(|ms| entry.admit(now + Duration::from_millis(*ms * 10))).count();
         assert_eq!(shown as u32, BURST + 11, "in a minute");
-        assert!(lines[0].starts_with("picture 0: the throttle is cut"), "{lines:?}");
-        assert_eq!(journal.counts()[&Event::UnreadableImage], 1000);
+    }
+
+    #[test]
+    fn bytes_of_a_client_never_reach_the_terminal_raw() {
+        let lines = lines_of(true, |journal| {
+            journal.report(Incident::NotSocketIo, format_args!("a packet \u{1b}[2J\u{9b}31m\u{202e}"));
+            journal.step(format_args!("a step \r\n\u{7}"));
+        });
+        assert!(lines[0].starts_with("a packet \\u{1b}[2J\\u{9b}31m\\u{202e}: "), "{lines:?}");
+        assert_eq!(lines[1], "a step \\r\\n\\u{7}");
+    }
+
+    #[test]
+    fn an_observer_that_fails_gets_no_more_events_and_its_error_is_kept() {
+        let mut told = 0;
+        let mut observer = |_| {
+            told += 1;
+            Err(Error::Interrupted)
+        };
+        let journal = Journal::new(&mut observer, true);
+        (0..3).for_each(|k| journal.step(format_args!("step {k}")));
+        assert!(journal.failed() && matches!(journal.into_result(), Err(Error::Interrupted)));
+        assert_eq!(told, 1);
     }
 }

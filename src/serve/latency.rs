@@ -1,31 +1,31 @@
-//! How long answers took.
+//! Latencies of the answers, as a histogram.
 
 use std::time::Duration;
 
-/// Width of a class, µs.
-const CLASS_US: u64 = 10;
-/// Classes; what took longer than 200 ms is counted in the last.
-const CLASSES: usize = 20_000;
+/// Width of a bin, µs.
+const BIN_US: u64 = 10;
+/// Number of bins. The last one counts everything above 200 ms.
+const BINS: usize = 20_000;
 
-/// Counts of durations in classes of 10 µs; keeps its size however many are added.
+/// A histogram of durations in bins of 10 µs. Its size does not grow with the number of durations.
 #[derive(Clone, Debug)]
 pub struct Latencies {
-    counts: Vec<u32>,
+    counts: Vec<u64>,
     total: u64,
     longest: Duration,
 }
 
 impl Default for Latencies {
     fn default() -> Self {
-        Latencies { counts: vec![0; CLASSES], total: 0, longest: Duration::ZERO }
+        Latencies { counts: vec![0; BINS], total: 0, longest: Duration::ZERO }
     }
 }
 
 impl Latencies {
     /// Adds a duration.
     pub fn add(&mut self, duration: Duration) {
-        let class = (duration.as_micros() as u64 / CLASS_US).min(CLASSES as u64 - 1);
-        self.counts[class as usize] += 1;
+        let bin = (duration.as_micros() as u64 / BIN_US).min(BINS as u64 - 1);
+        self.counts[bin as usize] += 1;
         self.total += 1;
         self.longest = self.longest.max(duration);
     }
@@ -40,21 +40,21 @@ impl Latencies {
         (self.total > 0).then_some(self.longest.as_secs_f64() * 1e3)
     }
 
-    /// The duration that the share `quantile` of them does not exceed, ms, rounded up to 10 µs.
+    /// The `quantile` of the durations, ms, rounded up to 10 µs.
     pub fn quantile_ms(&self, quantile: f64) -> Option<f64> {
         let rank = (quantile * self.total as f64).ceil().max(1.0) as u64;
         let mut below = 0;
-        let class = self.counts.iter().position(|count| {
-            below += u64::from(*count);
+        let bin = self.counts.iter().position(|count| {
+            below += *count;
             below >= rank
         })?;
-        if class == CLASSES - 1 {
+        if bin == BINS - 1 {
             return self.longest_ms();
         }
-        Some((class as u64 + 1) as f64 * CLASS_US as f64 / 1e3)
+        Some((bin as u64 + 1) as f64 * BIN_US as f64 / 1e3)
     }
 
-    /// Forgets all.
+    /// Removes all durations.
     pub fn clear(&mut self) {
         self.counts.fill(0);
         (self.total, self.longest) = (0, Duration::ZERO);

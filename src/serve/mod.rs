@@ -1,50 +1,53 @@
-//! Driving Udacity's simulator: the server that its client connects to.
+//! The server that drives Udacity's simulator: the simulator connects to it, sends telemetry, and gets commands.
 //!
-//! [`protocol`] and [`handshake`] hold what both sides say, without any input or output. [`Server`] listens; each
-//! connection has a thread of its own, and one of them holds the [`seat`] and drives: image in, [`Pilot`], [`helm`], command
-//! out. [`tokens`] keeps one question in flight, [`recording`] writes what was driven, [`journal`] says what is wrong.
-//! [`client`] is the other side: the built-in simulator connecting as Udacity's does.
+//! [`Server`] listens; each connection has a thread of its own, and one of them holds the [`seat`] and drives: a picture
+//! comes in, the [`Pilot`] steers, the [`helm`] makes the command. [`tokens`] keeps one telemetry in flight, [`recording`]
+//! writes what was driven, [`journal`] tells the user what is wrong and what to do. The messages are those of
+//! [`udacity`](crate::udacity).
 //!
-//! A client is never trusted: the number of connections, the size and the time of a message are bounded, and only a client
-//! that has shown a complete state of its car can drive it.
+//! The server trusts no client: it bounds the number of connections, and the size and the time of each message, and it
+//! drives only a client that has sent a complete state of its car.
 //!
 //! ```no_run
-//! use std::{path::Path, sync::atomic::AtomicBool};
+//! use std::path::Path;
+//! use steersman::observer::StopSignal;
 //! use steersman::pilot::Pilot;
-//! use steersman::serve::{Console, Server, ServerOptions};
-//!
-//! struct Terminal;
-//! impl Console for Terminal {
-//!     fn line(&self, text: &str) {
-//!         eprintln!("{text}");
-//!     }
-//!     fn status(&self, _: &str) {}
-//! }
+//! use steersman::serve::{ServeEvent, Server, ServerOptions};
 //!
 //! let pilot = Pilot::load(Path::new("runs/default-1/model.safetensors"))?;
-//! let stop = AtomicBool::new(false);
-//! let summary = Server::bind(ServerOptions::default())?.run(pilot, &Terminal, &stop)?;
+//! let mut observer = |event| {
+//!     if let ServeEvent::Line(text) = event {
+//!         eprintln!("{text}");
+//!     }
+//!     Ok(())
+//! };
+//! let stop = StopSignal::default(); // a request from elsewhere ends the server
+//! let summary = Server::bind(ServerOptions::default())?.run(pilot, &mut observer, &stop)?;
 //! println!("{} frames answered", summary.frames);
 //! # Ok::<(), steersman::Error>(())
 //! ```
 //!
 //! [`Pilot`]: crate::pilot::Pilot
 
-pub mod client;
 mod connection;
-pub mod handshake;
-pub mod helm;
-pub mod journal;
+mod handshake;
+mod helm;
+mod journal;
 mod latency;
-mod pace;
-pub mod protocol;
-pub mod recording;
-mod registry;
-pub mod seat;
+mod options;
+mod rate_limit;
+mod recording;
+mod seat;
 mod server;
-pub(crate) mod socket;
-pub mod tokens;
+mod server_event;
+mod shared;
+mod statistics;
+mod tokens;
 
 pub use helm::HelmOptions;
-pub use latency::Latencies;
-pub use server::{Console, Server, ServerOptions, Summary};
+pub use journal::Incident;
+pub use options::ServerOptions;
+pub use recording::Recorded;
+pub use server::Server;
+pub use server_event::ServeEvent;
+pub use statistics::Summary;

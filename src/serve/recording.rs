@@ -1,7 +1,7 @@
-//! Recording while driving: what the camera saw and what was answered, in the format of Udacity's simulator.
+//! Records a drive: the pictures and the commands, in the format of Udacity's simulator.
 //!
-//! The log has the seven columns of the original; left and right stay empty, because telemetry has one camera. Pictures are
-//! the bytes that came, not encoded again. Another thread writes, so that a slow disk costs rows and no time.
+//! The log has the seven columns of the original. Left and right stay empty, because telemetry has one camera. A picture is
+//! stored with the bytes that arrived. Another thread writes, so that a slow disk costs rows and not time.
 
 use std::fs::{self, File};
 use std::io::{BufWriter, ErrorKind, Write as _};
@@ -11,15 +11,14 @@ use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
 use std::thread::JoinHandle;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
-use time::OffsetDateTime;
-
-use super::helm::Clock;
-use super::protocol::Command;
+use super::helm::FrameTime;
+use crate::dataset::udacity_writer::{HEADER, picture_name, write_row};
 use crate::error::{Error, Result};
 use crate::files::new_folder::create_now;
+use crate::udacity::Command;
 
-/// Rows on their way to the disk; a second or two of driving.
-const QUEUE: usize = 64;
+/// Largest number of rows that wait for the disk: one or two seconds of driving.
+const MAX_QUEUED: usize = 64;
 
 /// Time in the names of pictures between two drives on simulated time, ms, so that they are not read as one.
 const BETWEEN_DRIVES_MS: u64 = 60_000;
@@ -27,28 +26,28 @@ const BETWEEN_DRIVES_MS: u64 = 60_000;
 /// One answered frame.
 #[derive(Debug)]
 pub struct Row {
-    /// When it was taken, ms since 1970.
+    /// Time of the frame, ms since 1970.
     pub time_ms: u64,
     /// The picture, encoded.
     pub image: Vec<u8>,
-    /// The answer.
+    /// The command.
     pub command: Command,
     /// Speed, mph.
     pub speed_mph: f64,
 }
 
-/// What became of a recording.
+/// A finished recording.
 #[derive(Clone, Debug, PartialEq, Eq, serde::Serialize)]
 pub struct Recorded {
     /// The folder.
     pub folder: PathBuf,
     /// Rows written.
     pub rows: u64,
-    /// Rows left out because the disk was too slow.
+    /// Rows that were left out because the disk was too slow.
     pub dropped: u64,
 }
 
-/// A recording that goes on.
+/// A recording under way.
 #[derive(Debug)]
 pub struct Recorder {
     folder: PathBuf,
@@ -67,12 +66,12 @@ struct State {
     simulated_s: Option<f64>,
 }
 
-/// Whether a row is on its way.
+/// What happened to a row.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Queued {
     /// It will be written.
     Yes,
-    /// The disk is too slow: it is left out.
+    /// It is left out, because the disk is too slow.
     Dropped,
     /// Nothing can be written any more; [`Recorder::finish`] says why.
     Failed,
@@ -90,24 +89,24 @@ impl Recorder {
         fs::create_dir(&images).map_err(Error::io(&images))?;
         let log = folder.join("driving_log.csv");
         let file = BufWriter::new(File::create_new(&log).map_err(Error::io(&log))?);
-        let (sender, receiver) = sync_channel(QUEUE);
+        let (sender, receiver) = sync_channel(MAX_QUEUED);
         let thread = std::thread::Builder::new().name("recording".into());
         let writer = thread.spawn(move || write(&images, &log, file, &receiver)).map_err(Error::io(folder))?;
         let state = State { dropped: 0, last_ms: 0, simulated_from_ms: now_ms(), simulated_s: None };
         Ok(Recorder { folder: folder.into(), sender, writer, state: Mutex::new(state) })
     }
 
-    /// Hands a row to the writer; `image` is copied. Never waits.
-    pub fn push(&self, clock: Clock, image: &[u8], command: Command, speed_mph: f64) -> Queued {
+    /// Copies `image` and hands a row to the writer. Never waits.
+    pub fn push(&self, time: FrameTime, image: &[u8], command: Command, speed_mph: f64) -> Queued {
         let mut state = self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-        let taken_ms = match clock {
-            Clock::Arrival(_) => {
+        let taken_ms = match time {
+            FrameTime::Arrival(_) => {
                 state.simulated_s = None;
                 now_ms()
             }
-            Clock::Simulated(time_s) => {
+            FrameTime::Simulated(time_s) => {
                 let simulated_ms = (time_s.max(0.0) * 1e3).round() as u64;
-                // Time that goes back is that of another drive, as is the first after frames with the server's time.
+                // Time that goes back begins another drive, as does the first frame after frames with the server's time.
                 if state.last_ms > 0 && state.simulated_s.is_none_or(|last_s| time_s < last_s) {
                     state.simulated_from_ms = (state.last_ms + BETWEEN_DRIVES_MS).saturating_sub(simulated_ms);
                 }
@@ -115,7 +114,7 @@ impl Recorder {
                 state.simulated_from_ms.saturating_add(simulated_ms)
             }
         };
-        // Names must differ, and the order of the rows is that of the frames.
+        // The names must differ, and the rows keep the order of the frames.
         let time_ms = taken_ms.clamp(state.last_ms + 1, state.last_ms.max(now_ms()) + 24 * 3_600_000);
         let row = Row { time_ms, image: image.to_vec(), command, speed_mph };
         match self.sender.try_send(row) {
@@ -131,11 +130,11 @@ impl Recorder {
         }
     }
 
-    /// Waits until all is written. A recording without a row is removed.
+    /// Waits until all rows are written, and removes a recording without a row.
     ///
     /// # Errors
     ///
-    /// What went wrong while writing; what was written stays.
+    /// If a row cannot be written. The rows before it stay.
     pub fn finish(self) -> Result<Recorded> {
         let Recorder { folder, sender, writer, state } = self;
         drop(sender);
@@ -148,7 +147,7 @@ impl Recorder {
     }
 }
 
-/// Removes a recording without a row. What somebody else has put there meanwhile stays.
+/// Removes a recording without a row, except for files that others have put there.
 fn remove_empty(folder: &Path) -> Result<()> {
     let log = folder.join("driving_log.csv");
     fs::remove_file(&log).map_err(Error::io(&log))?;
@@ -165,38 +164,23 @@ fn now_ms() -> u64 {
     SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or(Duration::ZERO).as_millis() as u64
 }
 
-/// Writes rows until there are no more; returns their number. A row is in the log only once its picture is on the disk.
+/// Writes rows until the sender is dropped, and returns their number. It writes the picture of a row before its line.
 fn write(images: &Path, log: &Path, mut file: BufWriter<File>, rows: &Receiver<Row>) -> Result<u64> {
     let mut written = 0;
-    writeln!(file, "center,left,right,steering,throttle,brake,speed").map_err(Error::io(log))?;
+    file.write_all(HEADER.as_bytes()).map_err(Error::io(log))?;
     while let Ok(row) = rows.recv() {
-        let name = image_name(row.time_ms);
+        let name = picture_name("center", row.time_ms);
         let path = images.join(&name);
         fs::write(&path, &row.image).map_err(Error::io(&path))?;
         let Command { steering, throttle } = row.command;
         let (accelerator, brake, speed) = (throttle.max(0.0), (-throttle).max(0.0), row.speed_mph as f32);
-        writeln!(file, "IMG/{name}, , , {steering}, {accelerator}, {brake}, {speed}")
+        let picture = format!("IMG/{name}");
+        write_row(&mut file, ", ", [&picture, &"", &""], [steering, accelerator, brake, speed])
             .and_then(|()| file.flush())
             .map_err(Error::io(log))?;
         written += 1;
     }
     Ok(written)
-}
-
-/// Name of a picture taken `time_ms` after 1970, UTC.
-fn image_name(time_ms: u64) -> String {
-    let time = i64::try_from(time_ms / 1000).ok().and_then(|s| OffsetDateTime::from_unix_timestamp(s).ok());
-    let time = time.unwrap_or(OffsetDateTime::UNIX_EPOCH);
-    format!(
-        "center_{:04}_{:02}_{:02}_{:02}_{:02}_{:02}_{:03}.jpg",
-        time.year(),
-        u8::from(time.month()),
-        time.day(),
-        time.hour(),
-        time.minute(),
-        time.second(),
-        time_ms % 1000
-    )
 }
 
 #[cfg(test)]
@@ -215,14 +199,6 @@ mod tests {
     }
 
     #[test]
-    fn names_carry_the_time_in_utc() {
-        assert_eq!(image_name(0), "center_1970_01_01_00_00_00_000.jpg");
-        // `date -u -d @1709210096` is 2024-02-29 12:34:56.
-        assert_eq!(image_name(1_709_210_096_789), "center_2024_02_29_12_34_56_789.jpg");
-        assert_eq!(image_name(u64::MAX), "center_1970_01_01_00_00_00_615.jpg");
-    }
-
-    #[test]
     fn a_recording_is_read_back_as_it_was_driven() {
         let scratch = tempfile::tempdir().unwrap();
         let folder = scratch.path().join("drive");
@@ -230,7 +206,7 @@ mod tests {
         let image = image();
         for frame in 0..20 {
             let command = Command { steering: frame as f32 / 20.0 - 0.5, throttle: frame as f32 / 10.0 - 1.0 };
-            let queued = recorder.push(Clock::Simulated(f64::from(frame) * 0.06), &image, command, 12.5);
+            let queued = recorder.push(FrameTime::Simulated(f64::from(frame) * 0.06), &image, command, 12.5);
             assert_eq!(queued, Queued::Yes);
         }
         let recorded = recorder.finish().unwrap();
@@ -249,7 +225,7 @@ mod tests {
         let scratch = tempfile::tempdir().unwrap();
         let folder = scratch.path().join("drive");
         let recorder = Recorder::start(&folder).unwrap();
-        let now = Clock::Arrival(Instant::now());
+        let now = FrameTime::Arrival(Instant::now());
         let queued = (0..30).filter(|_| recorder.push(now, b"x", Command::default(), 0.0) == Queued::Yes).count();
         let recorded = recorder.finish().unwrap();
         assert_eq!(recorded.rows, queued as u64);
@@ -262,7 +238,7 @@ mod tests {
         let folder = scratch.path().join("drive");
         let recorder = Recorder::start(&folder).unwrap();
         for time_s in [0.0, 0.06, 0.1, 0.0, 0.06, 0.1] {
-            assert_eq!(recorder.push(Clock::Simulated(time_s), &image(), Command::default(), 0.0), Queued::Yes);
+            assert_eq!(recorder.push(FrameTime::Simulated(time_s), &image(), Command::default(), 0.0), Queued::Yes);
         }
         recorder.finish().unwrap();
         let recording = dataset::load(&folder).unwrap();

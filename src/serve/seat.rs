@@ -1,13 +1,13 @@
-//! Who drives: one connection at a time.
+//! The seat: which connection is driven. One at a time has it.
 
 use std::net::{Shutdown, TcpStream};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-/// A driver that has been silent for longer can be relieved.
+/// A connection that is silent for longer can lose the seat.
 pub const SILENCE: Duration = Duration::from_secs(1);
 
-/// The driver's seat.
+/// The seat, empty or with its holder.
 #[derive(Debug, Default)]
 pub struct Seat(Mutex<Option<Holder>>);
 
@@ -21,11 +21,11 @@ struct Holder {
 /// The answer to a claim.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Claim {
-    /// The claimant sat there already.
+    /// The connection had the seat already.
     Kept,
-    /// The claimant drives from now on.
+    /// The connection has the seat from now on.
     Taken,
-    /// Another drives.
+    /// Another connection has it.
     Refused,
 }
 
@@ -35,8 +35,8 @@ impl Seat {
         self.lock().as_ref().is_none_or(|holder| holder.admits(id, now))
     }
 
-    /// Claims the seat at `now` for `id`, which has just shown a complete state of its car. A holder that was silent for
-    /// too long loses it, and its connection is closed.
+    /// Claims the seat at `now` for connection `id`, which has just sent a complete state of its car. A holder that was silent
+    /// for more than [`SILENCE`] loses the seat, and this closes its connection.
     pub fn claim(&self, id: u64, stream: &Arc<TcpStream>, now: Instant) -> Claim {
         let mut seat = self.lock();
         match &mut *seat {
@@ -56,7 +56,7 @@ impl Seat {
         }
     }
 
-    /// Whether `id` sits there; if so it was heard of at `now`.
+    /// Whether `id` has the seat. If so, this counts as a sign of life at `now`.
     pub fn is_held_by(&self, id: u64, now: Instant) -> bool {
         match &mut *self.lock() {
             Some(holder) if holder.id == id => {
@@ -67,7 +67,7 @@ impl Seat {
         }
     }
 
-    /// Leaves the seat, if `id` has it.
+    /// Gives the seat up, if `id` has it.
     pub fn leave(&self, id: u64) {
         let mut seat = self.lock();
         if seat.as_ref().is_some_and(|holder| holder.id == id) {
@@ -93,7 +93,7 @@ mod tests {
     use std::net::TcpListener;
 
     #[test]
-    fn only_a_silent_driver_is_relieved_and_its_connection_closed() {
+    fn only_a_silent_holder_loses_the_seat_and_its_connection() {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let mut client = TcpStream::connect(listener.local_addr().unwrap()).unwrap();
         let first = Arc::new(listener.accept().unwrap().0);

@@ -1,16 +1,16 @@
-//! Keeping one question in flight.
+//! Keeps one telemetry in flight.
 //!
-//! The simulator sends one telemetry for each event it receives, and one when it connects. So whoever answers each telemetry
-//! keeps as many of them circulating as there are, and several mean that the same picture is answered several times, the
-//! later ones late. Surplus telemetry is dropped here, until one circulates; the last is always answered, because the car
-//! would otherwise wait for ever.
+//! The simulator sends one telemetry when it connects, and one for each event it receives. A server that answers each
+//! telemetry keeps all of them circulating; with several, it answers the same picture several times, and the later answers are
+//! late. This module drops surplus telemetry until one circulates. It always answers the last one, because the car would
+//! otherwise wait for ever.
 
 use std::time::{Duration, Instant};
 
-/// How long telemetry is kept unanswered when another is expected.
+/// Longest time for which telemetry stays unanswered while another is expected.
 pub const PATIENCE: Duration = Duration::from_millis(50);
 
-/// Telemetry that a client owes us.
+/// Counts the telemetries that a client still has to send.
 #[derive(Clone, Debug)]
 pub struct Tokens {
     expected: u32,
@@ -18,25 +18,25 @@ pub struct Tokens {
 }
 
 impl Tokens {
-    /// For a client that sends `expected` telemetries of its own accord: the simulator sends 1.
+    /// For a client that sends `expected` telemetries without being asked: the simulator sends 1.
     pub fn new(expected: u32) -> Tokens {
         Tokens { expected, held_since: None }
     }
 
-    /// An event was sent, which the client will answer.
+    /// Counts an event that was sent: the client will answer it.
     pub fn sent(&mut self) {
         self.expected += 1;
         self.held_since = None;
     }
 
-    /// Telemetry came at `now`.
+    /// Counts telemetry that arrived at `now`.
     pub fn received(&mut self, now: Instant) {
         self.expected = self.expected.saturating_sub(1);
         self.held_since.get_or_insert(now);
     }
 
-    /// Whether the newest telemetry should be answered now: nothing better is on its way, or it did not come in time. Clients
-    /// may lose telemetry, so what is missing then is no longer expected.
+    /// Whether to answer the newest telemetry now: no other is expected, or the expected one did not arrive in time. A client
+    /// may lose telemetry, so after that time nothing more is expected.
     pub fn should_answer(&mut self, now: Instant) -> bool {
         match self.held_since {
             Some(_) if self.expected == 0 => true,

@@ -7,10 +7,11 @@ use sha2::{Digest, Sha256};
 
 use super::road::builtin;
 use super::road::spec::TrackSpec;
-use super::trial::run::run;
+use super::trial::run::run_trial;
 use super::trial::trajectory::trajectory_csv;
 use super::*;
 use crate::Error;
+use crate::observer::Unobserved;
 
 fn lake_spec() -> TrackSpec {
     toml::from_str(builtin::text("lake").unwrap()).unwrap()
@@ -70,7 +71,7 @@ fn random_tracks_exist_for_every_seed_and_high_seeds_are_held_out() {
         assert!((600.0..=1500.0).contains(&track.length_m), "random:{seed}: {} m", track.length_m);
         assert!(track.stations.iter().all(|s| s.curvature.abs() <= 1.0 / 25.0));
         // What is drawn passes the checks that a track file must pass, its stretches too.
-        Track::from_spec(track.spec, "again").unwrap();
+        Track::from_spec(track.spec.clone(), "again").unwrap();
     }
     assert!(matches!(Track::load("random:x"), Err(Error::Usage(m)) if m.contains("seed")));
 }
@@ -149,7 +150,7 @@ fn the_same_seed_gives_the_same_bytes_for_any_number_of_threads() {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         let options = RecordOptions { laps: 0.03, seed, noise: 0.05, ..Default::default() };
         let out = dir.path().join(name);
-        let info = pool.install(|| record(&track, &options, &out, &|_| true)).unwrap();
+        let info = pool.install(|| record(&track, &options, &out, &mut Unobserved)).unwrap();
         assert!(info.rows > 20);
         hash_of(&out)
     };
@@ -160,8 +161,9 @@ fn the_same_seed_gives_the_same_bytes_for_any_number_of_threads() {
 
 #[test]
 fn trajectories_repeat_to_the_bit() {
-    let options = RunOptions { laps: 1, speed: Speed::Auto, latency_ms: 60.0, noise: 0.05, assisted: true };
-    let drive = |seed| trajectory_csv(&run(&Track::load("random:5").unwrap(), &mut Expert, &options, seed).unwrap());
+    let options = TrialOptions { laps: 1, speed: Speed::Auto, latency_ms: 60.0, noise: 0.05, assisted: true };
+    let drive =
+        |seed| trajectory_csv(&run_trial(&Track::load("random:5").unwrap(), &mut Expert, &options, seed).unwrap());
     assert_eq!(drive(8), drive(8));
     assert_ne!(drive(8), drive(9));
 }
@@ -172,7 +174,7 @@ fn recordings_have_the_format_of_udacitys_simulator() {
     let track = Track::load("coast").unwrap();
     let sample = RecordOptions { laps: 0.01, ..Default::default() };
     let out = dir.path().join("new/sample");
-    record(&track, &sample, &out, &|_| true).unwrap();
+    record(&track, &sample, &out, &mut Unobserved).unwrap();
     let text = fs::read_to_string(out.join("driving_log.csv")).unwrap();
     let mut lines = text.lines();
     assert_eq!(lines.next(), Some("center,left,right,steering,throttle,brake,speed"));
@@ -192,17 +194,17 @@ fn recordings_have_the_format_of_udacitys_simulator() {
     assert_eq!(side["rows"].as_integer(), Some(text.lines().count() as i64 - 1));
 
     let before = hash_of(&out);
-    let refused = record(&track, &sample, &out, &|_| true).unwrap_err().to_string();
+    let refused = record(&track, &sample, &out, &mut Unobserved).unwrap_err().to_string();
     assert!(refused.contains("exists already"), "{refused}");
     assert_eq!(before, hash_of(&out));
 
     let v2 = dir.path().join("v2");
-    record(&track, &RecordOptions { format: LogFormat::V2, ..sample.clone() }, &v2, &|_| true).unwrap();
+    record(&track, &RecordOptions { format: LogFormat::V2, ..sample.clone() }, &v2, &mut Unobserved).unwrap();
     let text = fs::read_to_string(v2.join("driving_log.csv")).unwrap();
     let first: Vec<&str> = text.lines().next().unwrap().split(',').collect();
     assert!(first.len() == 7 && Path::new(first[0]).is_absolute() && Path::new(first[0]).exists());
 
-    let stopped = record(&track, &sample, &dir.path().join("stopped"), &|_| false);
+    let stopped = record(&track, &sample, &dir.path().join("stopped"), &mut |_| Err(Error::Interrupted));
     assert!(matches!(stopped, Err(Error::Interrupted)));
     let mut left: Vec<_> = fs::read_dir(dir.path()).unwrap().map(|entry| entry.unwrap().file_name()).collect();
     left.sort();

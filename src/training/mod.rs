@@ -10,7 +10,7 @@
 //! | `model.safetensors` | the best model, by validation loss |
 //! | `last.safetensors` | the model of the last epoch; with early stopping, in the end the best one |
 //! | `checkpoint.safetensors` | where the run stands |
-//! | `report.html` | the run in pictures; see [`crate::report::run`] |
+//! | `report.html` | the run in pictures; see [`crate::report::pages::run`] |
 //! | `result.json` | what `train --json` prints; its presence says that the run is finished |
 
 mod checkpoint;
@@ -28,6 +28,6 @@ pub use data::Data;
 pub use history::{EpochRecord, read_history, write_history};
 pub use profile::ProfileReport;
 pub use run_folder::{RunFolder, RunInfo};
-pub use session::{Observer, TrainRequest, TrainResult, resume, train};
+pub use session::{TrainRequest, TrainResult, TrainingEvent, resume, train};
 pub use transfer::TransferRequest;
 pub use validation::{Validation, ValidationResult};

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
+use steersman_kernels::conv::ConvAlgorithm;
 
 use super::history::{EpochRecord, read_history};
 use super::session::TrainResult;
@@ -26,6 +27,9 @@ pub struct RunInfo {
     pub version: String,
     /// Vector code it ran on.
     pub isa: String,
+    /// How its convolutions were computed, if not by the default algorithms: `im2col`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub algorithm: Option<String>,
     /// Seed of all random choices.
     pub seed: u64,
     /// Absolute paths of the recordings.
@@ -40,6 +44,19 @@ pub struct RunInfo {
     /// As in [`TrainingRecord`](crate::model_file::TrainingRecord).
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub trained_on_held_out: Vec<String>,
+}
+
+impl RunInfo {
+    /// How the convolutions of the run in `folder` are computed.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Data`] for an algorithm that this version does not know.
+    pub fn conv_algorithm(&self, folder: &RunFolder) -> Result<ConvAlgorithm> {
+        let named = self.algorithm.as_deref().map(str::parse).transpose();
+        let unknown = |message: String| Error::data(folder.file("run.json"), format!("algorithm: {message}"));
+        Ok(named.map_err(unknown)?.unwrap_or_default())
+    }
 }
 
 impl RunFolder {

@@ -1,11 +1,11 @@
 //! A training run from recordings to model files, and how it goes on after a stop.
 
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use serde::{Deserialize, Serialize};
-use steersman_kernels::Isa;
+use steersman_kernels::conv::ConvAlgorithm;
+use steersman_kernels::{Backend, Isa};
 
 use super::checkpoint::{Progress, State};
 use super::data::Data;
@@ -22,6 +22,7 @@ use crate::engine::stopwatch::Stopwatch;
 use crate::error::{Error, Result};
 use crate::files::atomic_file;
 use crate::model_file::{Model, TrainingRecord, weights_hash};
+use crate::observer::{Observer, StopSignal};
 use crate::recipe::{Keep, Recipe};
 
 /// Most images of one row: three cameras, each mirrored. A batch of whole rows has at least one row.
@@ -42,20 +43,35 @@ pub struct TrainRequest {
     pub cache_mib: usize,
     /// A model to begin from instead of fresh weights.
     pub from: Option<TransferRequest>,
+    /// How convolutions are computed; `None` for [`ConvAlgorithm::of_environment`].
+    pub algorithm: Option<ConvAlgorithm>,
+    /// Whether the result says where the time went.
+    pub profile: bool,
 }
 
-/// Whoever watches a run. All methods are called from the training thread.
-pub trait Observer {
+/// What happens in a run.
+#[derive(Clone, Debug, PartialEq)]
+pub enum TrainingEvent {
     /// Something the user should know.
-    fn notice(&mut self, text: &str);
-    /// Images of epoch `epoch` (from 1) that are done, of how many, and the mean loss of the last batch.
-    fn progress(&mut self, epoch: u32, images: usize, of: usize, loss: f64);
-    /// An epoch is done, of how many.
-    fn epoch(&mut self, record: &EpochRecord, of: u32);
-    /// Whether the result is to say where the time went.
-    fn wants_profile(&self) -> bool {
-        false
-    }
+    Notice(String),
+    /// A batch is done.
+    Batch {
+        /// Number of its epoch, from 1.
+        epoch: u32,
+        /// Images of the epoch that are done.
+        images: usize,
+        /// Images of the epoch in all.
+        of: usize,
+        /// Mean loss of the batch.
+        loss: f64,
+    },
+    /// An epoch is done.
+    Epoch {
+        /// Its figures.
+        record: EpochRecord,
+        /// Epochs in all.
+        of: u32,
+    },
 }
 
 /// What a run came to; `train --json` prints it.
@@ -86,6 +102,9 @@ pub struct TrainResult {
     pub seconds: f64,
     /// Training images a second while training, validation left out.
     pub images_per_second: f64,
+    /// How convolutions were computed, if not by the default algorithms: `im2col`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub algorithm: Option<String>,
     /// Over all tensors of the last model.
     pub weights_hash: String,
     /// Share of validation frames with a training frame of the same session within a second, in percent.
@@ -93,21 +112,26 @@ pub struct TrainResult {
     /// Held-out tracks that were trained on all the same, here or by the model that training began from.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub trained_on_held_out: Vec<String>,
-    /// Where the time went, if the observer wants to know.
+    /// Where the time went, if that was asked for.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub profile: Option<ProfileReport>,
 }
 
-/// Trains anew. Call it inside a rayon pool; `stop` ends it after the current batch.
+/// Trains anew. Call it inside a rayon pool; `stop` and errors of `observer` end it after the current batch.
 ///
 /// # Errors
 ///
 /// [`Error::Data`] and [`Error::Io`] for recordings that cannot be used, [`Error::Usage`] for a folder that is not empty or
-/// a run that diverges, [`Error::Interrupted`] after saving if `stop` is set.
-pub fn train(request: TrainRequest, observer: &mut dyn Observer, stop: &AtomicBool) -> Result<TrainResult> {
+/// a run that diverges, [`Error::Interrupted`] after saving if `stop` is requested; the observer's own.
+pub fn train(
+    request: TrainRequest,
+    observer: &mut dyn Observer<TrainingEvent>,
+    stop: &StopSignal,
+) -> Result<TrainResult> {
     let started = Instant::now();
-    let profile = observer.wants_profile().then(Profile::start);
-    let TrainRequest { recordings, recipe, out, seed, cache_mib, from } = request;
+    let TrainRequest { recordings, recipe, out, seed, cache_mib, from, algorithm, profile } = request;
+    let profile = profile.then(Profile::start);
+    let algorithm = algorithm.unwrap_or_else(ConvAlgorithm::of_environment);
     let start = from.as_ref().map(|from| Start::load(&from.model, from, &recipe, seed)).transpose()?;
     let data = Data::prepare(&recordings, &recipe, seed, cache_mib)?;
     let mut trained_on_held_out = held_out_tracks(&recordings)?;
@@ -122,6 +146,7 @@ pub fn train(request: TrainRequest, observer: &mut dyn Observer, stop: &AtomicBo
     let info = RunInfo {
         version: env!("CARGO_PKG_VERSION").into(),
         isa: Isa::best().name().into(),
+        algorithm: (algorithm != ConvAlgorithm::Auto).then(|| algorithm.to_string()),
         seed,
         recordings: recordings.iter().map(absolute).collect::<Result<_>>()?,
         cache_mib,
@@ -139,28 +164,34 @@ pub fn train(request: TrainRequest, observer: &mut dyn Observer, stop: &AtomicBo
     session.measured(profile).run(observer, stop)
 }
 
-/// Goes on with the run in `path`, as if it had never stopped; prints the result again if it is finished.
+/// Goes on with the run in `path`, as if it had never stopped; returns the result again if it is finished. With `profile` the
+/// result says where the time went.
 ///
 /// # Errors
 ///
 /// As [`train`]; [`Error::Data`] also for damaged run folders and recordings that have changed.
-pub fn resume(path: &Path, observer: &mut dyn Observer, stop: &AtomicBool) -> Result<TrainResult> {
+pub fn resume(
+    path: &Path,
+    profile: bool,
+    observer: &mut dyn Observer<TrainingEvent>,
+    stop: &StopSignal,
+) -> Result<TrainResult> {
     let started = Instant::now();
-    let profile = observer.wants_profile().then(Profile::start);
+    let profile = profile.then(Profile::start);
     let folder = RunFolder::open(path)?;
     if let Some(result) = folder.result()? {
-        observer.notice("this run is finished; here is its result again");
+        observer.observe(TrainingEvent::Notice("this run is finished; here is its result again".into()))?;
         return Ok(TrainResult { model: folder.model(), ..result });
     }
     let info = folder.info()?;
     let recipe = folder.recipe()?;
     let isa = Isa::best().name();
     if info.isa != isa {
-        observer.notice(&format!(
+        observer.observe(TrainingEvent::Notice(format!(
             "the run began with {} vector code and goes on with {isa}: the last bits will differ; STEERSMAN_ISA={} \
              keeps them, where the machine has it",
             info.isa, info.isa
-        ));
+        )))?;
     }
     let data = Data::prepare(&info.recordings, &recipe, info.seed, info.cache_mib)?;
     if data.rows_hash() != info.rows_hash {
@@ -199,7 +230,7 @@ impl Session {
         start: Option<Start>,
         started: Instant,
     ) -> Result<Session> {
-        let mut network = recipe.network(Isa::best())?;
+        let mut network = recipe.network(Backend { isa: Isa::best(), conv: info.conv_algorithm(&folder)? })?;
         if let Some(start) = &start {
             network.freeze(&start.transfer.frozen)?;
         }
@@ -259,9 +290,9 @@ impl Session {
         Ok(())
     }
 
-    fn run(mut self, observer: &mut dyn Observer, stop: &AtomicBool) -> Result<TrainResult> {
+    fn run(mut self, observer: &mut dyn Observer<TrainingEvent>, stop: &StopSignal) -> Result<TrainResult> {
         for notice in &self.notices {
-            observer.notice(notice);
+            observer.observe(TrainingEvent::Notice(notice.clone()))?;
         }
         let seconds_before = self.state.progress.seconds;
         let mut images_unreported = true;
@@ -285,13 +316,15 @@ impl Session {
             if validation.is_some_and(|v| !v.mse.is_finite()) {
                 return Err(self.diverged("the validation loss is not finite"));
             }
-            self.end_epoch(validation, epoch_started, observer);
+            let record = self.end_epoch(validation, epoch_started);
+            let observed = observer.observe(TrainingEvent::Epoch { record, of: self.recipe.epochs });
             if whole && std::mem::take(&mut images_unreported) {
-                self.report_images(observer);
+                self.report_images(observer)?;
             }
             self.state.progress.seconds = seconds_before + self.started.elapsed().as_secs_f64();
             write_history(&self.folder.file("history.csv"), &self.state.progress.history)?;
             self.save_checkpoint()?;
+            observed?;
         }
         self.finish()
     }
@@ -300,8 +333,8 @@ impl Session {
     fn train_epoch(
         &mut self,
         [current, next]: &mut [Batch; 2],
-        observer: &mut dyn Observer,
-        stop: &AtomicBool,
+        observer: &mut dyn Observer<TrainingEvent>,
+        stop: &StopSignal,
         seconds_before: f64,
     ) -> Result<()> {
         let epoch = self.state.progress.epoch;
@@ -347,12 +380,17 @@ impl Session {
             progress.images += current.n;
             progress.next_batch = following;
             progress.train_seconds = seconds_of_epoch_before + started.elapsed().as_secs_f64();
-            observer.progress(epoch + 1, progress.images, training.samples(), mean_loss);
+            let observed = observer.observe(TrainingEvent::Batch {
+                epoch: epoch + 1,
+                images: progress.images,
+                of: training.samples(),
+                loss: mean_loss,
+            });
             std::mem::swap(current, next);
-            if stop.load(Ordering::Relaxed) {
+            if let Err(error) = observed.and_then(|()| stop.check()) {
                 self.state.progress.seconds = seconds_before + self.started.elapsed().as_secs_f64();
                 self.save_checkpoint()?;
-                return Err(Error::Interrupted);
+                return Err(error);
             }
         }
         Ok(())
@@ -366,7 +404,7 @@ impl Session {
         ))
     }
 
-    fn end_epoch(&mut self, validation: Option<ValidationResult>, started: Instant, observer: &mut dyn Observer) {
+    fn end_epoch(&mut self, validation: Option<ValidationResult>, started: Instant) -> EpochRecord {
         let State { parameters, best, progress, .. } = &mut self.state;
         let record = EpochRecord {
             epoch: progress.epoch + 1,
@@ -404,7 +442,7 @@ impl Session {
                 progress.epochs_since_improvement += 1;
             }
         }
-        observer.epoch(&record, self.recipe.epochs);
+        record
     }
 
     fn stop_early(&self) -> bool {
@@ -455,14 +493,16 @@ impl Session {
     }
 
     /// What is only known once every image has been decoded.
-    fn report_images(&self, observer: &mut dyn Observer) {
+    fn report_images(&self, observer: &mut dyn Observer<TrainingEvent>) -> Result<()> {
         let sides = [Some(self.training.undecodable()), self.validation.as_ref().map(Validation::undecodable)];
         for (count, examples) in sides.into_iter().flatten().filter(|(count, _)| *count > 0) {
-            observer.notice(&format!("{count} images cannot be decoded and are left out: {}", examples.join("; ")));
+            let notice = format!("{count} images cannot be decoded and are left out: {}", examples.join("; "));
+            observer.observe(TrainingEvent::Notice(notice))?;
         }
         if let Some(validation) = &self.validation {
-            observer.notice(&validation.near_twins(&self.training).summary());
+            observer.observe(TrainingEvent::Notice(validation.near_twins(&self.training).summary()))?;
         }
+        Ok(())
     }
 
     fn finish(mut self) -> Result<TrainResult> {
@@ -493,6 +533,7 @@ impl Session {
             val_images: self.validation.as_ref().map_or(0, Validation::images),
             seconds: progress.seconds,
             images_per_second: images as f64 / seconds,
+            algorithm: self.info.algorithm.clone(),
             weights_hash: weights_hash(&self.network, &self.state.parameters),
             leak_percent: self.leak_percent,
             trained_on_held_out: self.info.trained_on_held_out.clone(),

@@ -1,6 +1,6 @@
 //! The held-out side, after each epoch.
 
-use crate::dataset::Camera;
+use crate::dataset::View;
 use crate::dataset::leak::NearTwins;
 use crate::dataset::loader::{Batch, Loader, LoaderTimes};
 use crate::engine::network::{InferencePlan, Network, Parameters};
@@ -85,7 +85,7 @@ impl Validation {
                 let (label, error) = (f64::from(*label), f64::from(*prediction) - f64::from(*label));
                 squares += error * error;
                 images += 1;
-                if sample.camera == Camera::Centre && !sample.mirrored {
+                if sample.camera == View::Centre && !sample.mirrored {
                     center_squares += error * error;
                     center_absolute += error.abs();
                     label_squares += label * label;

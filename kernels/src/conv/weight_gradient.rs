@@ -1,57 +1,59 @@
-//! The weight gradient, with vectors along the positions of the output.
+//! The weight gradient of the direct algorithm, with vectors along the positions of the output.
 //!
-//! `dweight[o][k] = sum over p of dy[o][p] * x[start(p) + taps[k]]`. A tile is 8 output channels by 3 taps: for each
+//! Forward is `y[o][p] = bias[o] + sum over k of weight[o][k] * x[start(p) + taps[k]]`, so
+//! `dweight[o][k] = sum over p of dy[o][p] * x[start(p) + taps[k]]` and `dbias[o] = sum over p of dy[o][p]`. A tile is 8 output channels by 3 taps: for each
 //! vector of positions it loads 8 vectors of `dy` and 3 of `x` for 24 multiply-adds. Sums stay spread over the lanes
 //! until the end. So that `dy` comes from the first-level cache, a chunk of `CHUNK` vectors is packed once and all taps
 //! run over it; the sums of a panel of channels wait in scratch meanwhile.
 
-use super::direct::{MOST_CHANNELS, TapSum};
-use crate::simd::{ALIGNMENT, MOST_LANES, Simd, align};
+use super::tap_sum::{MAX_CHANNELS, TapSum};
+use crate::simd::{ALIGNMENT, MAX_LANES, Simd, align};
 
 /// Taps in a tile.
 pub(super) const TILE_TAPS: usize = 3;
 /// Vectors of positions that are packed at a time: 32 x 8 channels x 64 bytes, or 64 x 4 x 32, are at most half of a
 /// 32 KiB cache.
-const MOST_CHUNK: usize = 64;
+const MAX_CHUNK: usize = 64;
 const CHUNK_OF_MANY_REGISTERS: usize = 32;
 
 const fn chunk_vectors<S: Simd>() -> usize {
-    if S::MANY_REGISTERS { CHUNK_OF_MANY_REGISTERS } else { MOST_CHUNK }
+    if S::MANY_REGISTERS { CHUNK_OF_MANY_REGISTERS } else { MAX_CHUNK }
 }
-/// The most vectors of a packed chunk: 32 of 8 channels; 64 of 4, where there are 16 registers, are as many.
-const MOST_PACKED: usize = CHUNK_OF_MANY_REGISTERS * MOST_CHANNELS;
+/// The largest number of vectors of a packed chunk: 32 of 8 channels; 64 of 4, where there are 16 registers, are as many.
+const MAX_PACKED: usize = CHUNK_OF_MANY_REGISTERS * MAX_CHANNELS;
 
-/// Elements of scratch for `taps` taps.
+/// Length of the scratch for `taps` taps.
 pub(crate) fn scratch_len(taps: usize) -> usize {
-    (MOST_PACKED + taps.next_multiple_of(TILE_TAPS) * MOST_CHANNELS) * MOST_LANES + ALIGNMENT
+    (MAX_PACKED + taps.next_multiple_of(TILE_TAPS) * MAX_CHANNELS) * MAX_LANES + ALIGNMENT
 }
 
-/// Channels of a tile for `channels` in all: the height that leaves the fewest rows empty, of 24 or 18 accumulators, or 12 or 9
-/// where there are 16 registers.
+/// Channels of a tile, for `channels` in all: of the heights with 24 and 18 accumulators (12 and 9 where there are 16
+/// registers), the one that leaves fewer rows of tiles empty.
 pub(super) fn tile_height(many_registers: bool, channels: usize) -> usize {
     let heights = if many_registers { [8, 6] } else { [4, 3] };
     let rows = |height: usize| channels.div_ceil(height) * height;
     if rows(heights[0]) <= rows(heights[1]) { heights[0] } else { heights[1] }
 }
 
-/// Adds the gradient of the images in `dy` to `dweight` and `dbias`.
-///
-/// `sum` is the forward pass: its taps, positions and sizes, `x` its input.
-#[inline(always)]
-pub(crate) fn run<S: Simd>(
-    simd: S,
-    sum: &TapSum,
-    x: &[f32],
-    dy: &[f32],
-    dweight: &mut [f32],
-    dbias: &mut [f32],
-    scratch: &mut [f32],
-) {
-    match tile_height(S::MANY_REGISTERS, sum.channels) {
-        8 if S::MANY_REGISTERS => run_height::<S, 8>(simd, sum, x, dy, dweight, dbias, scratch),
-        6 if S::MANY_REGISTERS => run_height::<S, 6>(simd, sum, x, dy, dweight, dbias, scratch),
-        4 => run_height::<S, 4>(simd, sum, x, dy, dweight, dbias, scratch),
-        _ => run_height::<S, 3>(simd, sum, x, dy, dweight, dbias, scratch),
+per_isa! {
+    /// Adds the gradient of the images in `dy` to `dweight` and `dbias`.
+    ///
+    /// `sum` is the forward pass: its taps, positions and sizes, `x` its input.
+    pub(super) fn run<S>(
+        simd: S,
+        sum: &TapSum,
+        x: &[f32],
+        dy: &[f32],
+        dweight: &mut [f32],
+        dbias: &mut [f32],
+        scratch: &mut [f32],
+    ) {
+        match (S::MANY_REGISTERS, tile_height(S::MANY_REGISTERS, sum.channels)) {
+            (true, 8) => run_height::<S, 8>(simd, sum, x, dy, dweight, dbias, scratch),
+            (true, _) => run_height::<S, 6>(simd, sum, x, dy, dweight, dbias, scratch),
+            (false, 4) => run_height::<S, 4>(simd, sum, x, dy, dweight, dbias, scratch),
+            (false, _) => run_height::<S, 3>(simd, sum, x, dy, dweight, dbias, scratch),
+        }
     }
 }
 
@@ -70,7 +72,7 @@ fn run_height<S: Simd, const MR: usize>(
     let images = dy.len() / image_len;
     sum.check::<S>(images, x.len(), dy.len());
     assert!(dweight.len() == sum.channels * taps && dbias.len() == sum.channels, "weight gradient: wrong length");
-    debug_assert!(chunk_vectors::<S>() * MR <= MOST_PACKED && MR <= MOST_CHANNELS && S::LANES <= MOST_LANES);
+    debug_assert!(chunk_vectors::<S>() * MR <= MAX_PACKED && MR <= MAX_CHANNELS && S::LANES <= MAX_LANES);
     let total = images * sum.spans.len();
     if total == 0 {
         return;
@@ -87,7 +89,7 @@ fn run_height<S: Simd, const MR: usize>(
         let mut bias = [simd.splat(0.0); MR];
         for chunk in (0..total).step_by(chunk_vectors::<S>()) {
             let count = chunk_vectors::<S>().min(total - chunk);
-            let mut starts = [0; MOST_CHUNK];
+            let mut starts = [0; MAX_CHUNK];
             let mut whole = 0;
             for i in 0..count {
                 let image = (chunk + i) / sum.spans.len();
@@ -149,8 +151,10 @@ pub(super) unsafe fn add_lanes<S: Simd>(simd: S, sums: *const f32, to: &mut [f32
 /// overwrites them.
 ///
 /// # Safety
-/// `packed` holds `starts.len() * MR` vectors, and `sums` `TILE_TAPS` from each of `MR` places `row` vectors apart. From each start plus each offset, `LANES`
-/// elements of `x` are readable for the first `whole` vectors, and as many as the span reaches for the others.
+/// - `packed` holds `starts.len() * MR` vectors.
+/// - `sums` holds `MR` rows of `TILE_TAPS` vectors, `row` vectors apart.
+/// - From each start plus each offset, `LANES` elements of `x` are readable for the first `whole` vectors, and as many as
+///   the span reaches for the others.
 #[inline(always)]
 unsafe fn tile<S: Simd, const MR: usize>(
     simd: S,

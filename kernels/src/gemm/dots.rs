@@ -1,48 +1,36 @@
 //! Products of few rows with a transposed matrix: dot products of contiguous rows.
 
+use crate::matrix::{Matrix, MatrixMut};
 use crate::simd::Simd;
 
 /// Columns of `C` in a tile.
 const TILE_COLUMNS: usize = 3;
-/// Elements of the rows that a tile goes through before the next: 8 rows of them take half of a 32 KiB cache.
+/// Length of the rows that a tile reads before the next tile: 8 such rows take half of a 32 KiB cache.
 const BLOCK_K: usize = 512;
 
 per_isa! {
-    /// `C = alpha A B + beta C`, where rows of `A` and columns of `B` are contiguous and `k > 0`; `a` and `b` come with
-    /// the distance between them. The caller has checked the lengths; an error here can only panic.
-    pub(super) fn run<S>(
-        simd: S,
-        sizes: (usize, usize, usize),
-        alpha: f32,
-        a: (&[f32], usize),
-        b: (&[f32], usize),
-        beta: f32,
-        c: (&mut [f32], (usize, usize)),
-    ) {
+    /// `C = alpha A B + beta C`, where rows of `A` and columns of `B` are contiguous and there is at least one. The caller has checked
+    /// the lengths; an error here can only panic.
+    pub(super) fn run<S>(simd: S, alpha: f32, a: Matrix, b: Matrix, beta: f32, c: &mut MatrixMut) {
         if S::MANY_REGISTERS {
-            run_rows::<S, 8>(simd, sizes, alpha, a, b, beta, c);
+            run_rows::<S, 8>(simd, alpha, a, b, beta, c);
         } else {
-            run_rows::<S, 4>(simd, sizes, alpha, a, b, beta, c);
+            run_rows::<S, 4>(simd, alpha, a, b, beta, c);
         }
     }
 }
 
 #[inline(always)]
-fn run_rows<S: Simd, const MR: usize>(
-    simd: S,
-    (m, k, n): (usize, usize, usize),
-    alpha: f32,
-    (a, a_stride): (&[f32], usize),
-    (b, b_stride): (&[f32], usize),
-    beta: f32,
-    (c, c_strides): (&mut [f32], (usize, usize)),
-) {
+fn run_rows<S: Simd, const MR: usize>(simd: S, alpha: f32, a: Matrix, b: Matrix, beta: f32, c: &mut MatrixMut) {
+    let (m, k, n) = (a.rows, a.columns, b.columns);
+    let (a, a_stride, b, b_stride) = (a.values, a.strides.0, b.values, b.strides.1);
+    let (c, c_strides) = (&mut *c.values, c.strides);
     for first_k in (0..k).step_by(BLOCK_K) {
         let depth = BLOCK_K.min(k - first_k);
         let beta = if first_k == 0 { beta } else { 1.0 };
         for i in (0..m).step_by(MR) {
             for j in (0..n).step_by(TILE_COLUMNS) {
-                // A tile that hangs over the edge repeats the last row or column and drops what comes of it.
+                // A tile at the edge repeats the last row or column and drops those results.
                 let mut rows = [a; MR];
                 for (r, row) in rows.iter_mut().enumerate() {
                     *row = &a[(i + r).min(m - 1) * a_stride + first_k..][..depth];

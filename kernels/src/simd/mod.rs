@@ -1,7 +1,7 @@
 //! One trait for the vector instructions the kernels need, and a type for each instruction set.
 //!
 //! The types are tokens: those of [`x86`] and [`neon`] can only be made in code compiled for their instruction set, so
-//! their arithmetic is safe. What takes a pointer is not. Every method is `#[inline(always)]`, so that it lands in a
+//! their arithmetic is safe. Methods that take a pointer are unsafe. Every method is `#[inline(always)]`, so that it lands in a
 //! function compiled for its instruction set (see `per_isa!`).
 
 #[cfg(target_arch = "aarch64")]
@@ -10,11 +10,11 @@ pub(crate) mod portable;
 #[cfg(target_arch = "x86_64")]
 pub(crate) mod x86;
 
-/// Elements in a cache line: a vector that crosses from one line into the next costs two loads.
+/// Elements of a cache line. A vector that crosses from one line into the next costs two loads.
 pub(crate) const ALIGNMENT: usize = 16;
 
-/// The most lanes a vector has on any instruction set.
-pub(crate) const MOST_LANES: usize = 16;
+/// The largest number of lanes of a vector, on any instruction set.
+pub(crate) const MAX_LANES: usize = 16;
 
 /// The part of `scratch` that begins on a cache line; up to `ALIGNMENT` elements are lost.
 #[inline(always)]
@@ -31,7 +31,7 @@ pub(crate) fn get<S: Simd>(simd: S, from: &[f32], at: usize) -> S::V {
     unsafe { simd.load(from.as_ptr()) }
 }
 
-/// The elements from `at` on, at most `LANES`, and 0 in the lanes after the last.
+/// The first `count` elements from `at` on, at most `LANES`; the lanes after them are 0.
 #[inline(always)]
 pub(crate) fn get_first<S: Simd>(simd: S, from: &[f32], at: usize, count: usize) -> S::V {
     let from = &from[at..at + count.min(S::LANES)];
@@ -71,18 +71,18 @@ pub(crate) fn put_pairs<S: Simd>(simd: S, to: &mut [f32], at: usize, v: [S::V; 2
     unsafe { simd.store_pairs(to.as_mut_ptr(), v, to.len() / 2) };
 }
 
-/// What a cache line is fetched for.
+/// The purpose of a prefetch.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Purpose {
-    /// To be read soon: into the first level.
+    /// The data is read soon: into the first-level cache.
     ReadSoon,
-    /// To be read before long: into the second level.
+    /// The data is read later: into the second-level cache.
     ReadLater,
-    /// To be written to soon.
+    /// The line is written soon.
     Write,
 }
 
-/// Has part `part` of `parts` of what is to be read before long fetched into the second-level cache.
+/// Prefetches part `part` of `parts` equal parts of `upcoming` into the second-level cache.
 #[inline(always)]
 pub(crate) fn prefetch_part<S: Simd>(simd: S, upcoming: &[f32], part: usize, parts: usize) {
     let lines = upcoming.len() / ALIGNMENT;
@@ -99,7 +99,7 @@ pub(crate) trait Simd: Copy {
     type M: Copy;
     /// Values in a vector, at most 16.
     const LANES: usize;
-    /// Whether there are 32 registers, enough for 24 accumulators, and not 16, enough for 12.
+    /// Whether there are 32 registers (enough for 24 accumulators) and not 16 (enough for 12).
     const MANY_REGISTERS: bool;
 
     /// The value in every lane.
@@ -135,7 +135,7 @@ pub(crate) trait Simd: Copy {
         sums
     }
 
-    /// Has the cache line of an address fetched; any address will do.
+    /// Prefetches the cache line of an address, which need not be valid.
     #[inline(always)]
     fn prefetch(self, p: *const f32, purpose: Purpose) {
         let _ = (p, purpose);
@@ -151,18 +151,18 @@ pub(crate) trait Simd: Copy {
     /// # Safety
     /// `p` must be valid for reading `count` values.
     unsafe fn load_first(self, p: *const f32, count: usize) -> Self::V;
-    /// Reads `count <= LANES` pairs of values: first those at even places, then those at odd ones. Which pair is in which
-    /// lane is for the instruction set to say, see [`Simd::to_pair_order`]; the lanes of those not read are 0.
+    /// Reads `count <= LANES` pairs of values: the first vector holds the first value of each pair, the second vector the second.
+    /// The order of the pairs in the lanes depends on the instruction set, see [`Simd::to_pair_order`]; unused lanes are 0.
     ///
     /// # Safety
     /// `p` must be valid for reading `2 count` values.
     unsafe fn load_pairs(self, p: *const f32, count: usize) -> [Self::V; 2];
-    /// Brings one value for each pair, lane by lane, in the order of [`Simd::load_pairs`].
+    /// Moves the lanes from the order of memory to the order of [`Simd::load_pairs`].
     #[inline(always)]
     fn to_pair_order(self, v: Self::V) -> Self::V {
         v
     }
-    /// The reverse of [`Simd::to_pair_order`].
+    /// Moves the lanes from the order of [`Simd::load_pairs`] to the order of memory.
     #[inline(always)]
     fn to_memory_order(self, v: Self::V) -> Self::V {
         v
@@ -225,7 +225,7 @@ pub(crate) trait Simd: Copy {
     }
 
     /// Reads every second of the first `2 count - 1` values into the first `count <= LANES` lanes, `count` at least 1;
-    /// what the other lanes hold is not said.
+    /// the other lanes are unspecified.
     ///
     /// # Safety
     /// `p` must be valid for reading `2 count - 1` values.

@@ -6,7 +6,7 @@
 use super::{Purpose, Simd};
 use std::arch::x86_64::*;
 
-/// Has a cache line fetched.
+/// Prefetches a cache line.
 #[inline(always)]
 fn prefetch(p: *const f32, purpose: Purpose) {
     // SAFETY: the instructions read and write nothing, whatever the address; those of the first and second level belong to

@@ -1,10 +1,9 @@
 //! Convolution and its gradients.
 
 use super::{Failures, isas, nans, numbers};
-use steersman_kernels::conv::{Conv, ConvShape};
-use steersman_kernels::gemm::{gemm, gemm_scratch_len};
+use steersman_kernels::conv::{Conv, ConvAlgorithm, ConvShape};
 use steersman_kernels::im2col::{col2im, im2col};
-use steersman_kernels::{baseline, reference};
+use steersman_kernels::{Backend, Isa, reference};
 
 /// Sizes c, h, w, oc; kernel; stride; padding top, bottom, left, right.
 type Case = ([usize; 4], [usize; 2], [usize; 2], [usize; 4]);
@@ -52,6 +51,8 @@ const CASES: &[Case] = &[
     ([64, 62, 70, 8], [3, 3], [1, 1], [0; 4]),
     ([3, 37, 60, 8], [5, 5], [2, 2], [0; 4]),
     ([6, 2, 100, 8], [3, 3], [1, 1], [0, 2, 0, 0]),
+    // A 1x1 kernel, whose columns are the image itself.
+    ([6, 5, 7, 9], [1, 1], [1, 1], [0; 4]),
     // A kernel that does not fit: no output.
     ([2, 2, 2, 3], [3, 3], [1, 1], [0; 4]),
 ];
@@ -59,6 +60,12 @@ const CASES: &[Case] = &[
 fn shape(&([c, h, w, oc], [kh, kw], [stride_h, stride_w], pad): &Case) -> ConvShape {
     let [pad_top, pad_bottom, pad_left, pad_right] = pad;
     ConvShape { c, h, w, oc, kh, kw, stride_h, stride_w, pad_top, pad_bottom, pad_left, pad_right }
+}
+
+/// Every instruction set with the algorithm of its choice, and the textbook algorithm, which has but one.
+fn backends() -> Vec<Backend> {
+    let auto = isas().into_iter().map(|isa| Backend { isa, conv: ConvAlgorithm::Auto });
+    auto.chain([Backend { isa: Isa::PORTABLE, conv: ConvAlgorithm::Im2col }]).collect()
 }
 
 #[test]
@@ -77,15 +84,9 @@ fn convolutions_agree_with_the_loops() {
             reference::conv_forward(&shape, n, &x, &weight, &bias, &mut y);
             reference::conv_backward_input(&shape, n, &dy, &weight, &mut dx);
             reference::conv_backward_weight(&shape, n, &x, &dy, &mut dweight, &mut dbias);
-            let mut actual = nans(n * y_len);
-            baseline::conv_forward(&shape, n, &x, &weight, &bias, &mut actual);
-            failures.compare(&format!("baseline forward n={n} {shape:?}"), &actual, &y, 1e-5);
-            let mut actual = nans(n * x_len);
-            baseline::conv_backward_input(&shape, n, &dy, &weight, &mut actual);
-            failures.compare(&format!("baseline backward_input n={n} {shape:?}"), &actual, &dx, 1e-5);
-            for isa in isas() {
-                let conv = Conv::new(shape, isa);
-                let what = format!("{} n={n} {shape:?}", isa.name());
+            for backend in backends() {
+                let conv = Conv::new(shape, backend);
+                let what = format!("{} {} n={n} {shape:?}", backend.isa.name(), backend.conv);
                 let mut actual = nans(n * y_len);
                 conv.forward(n, &x, &weight, &bias, &mut actual, &mut nans(conv.scratch_len()));
                 failures.compare(&format!("forward {what}"), &actual, &y, 1e-5);
@@ -118,8 +119,8 @@ fn the_result_of_an_image_does_not_depend_on_the_batch() {
         let (x_len, y_len) = (shape.c * shape.h * shape.w, shape.oc * shape.out_h() * shape.out_w());
         let weight = numbers(1, shape.oc * shape.c * shape.kh * shape.kw);
         let bias = numbers(2, shape.oc);
-        for isa in isas() {
-            let conv = Conv::new(shape, isa);
+        for backend in backends() {
+            let conv = Conv::new(shape, backend);
             let mut scratch = nans(conv.scratch_len());
             let (n, x, dy) = (11, numbers(3, 11 * x_len), numbers(4, 11 * y_len));
             let (mut y, mut dx) = (nans(n * y_len), nans(n * x_len));
@@ -129,39 +130,35 @@ fn the_result_of_an_image_does_not_depend_on_the_batch() {
                 let (mut y_alone, mut dx_alone) = (nans(y_len), nans(x_len));
                 conv.forward(1, &x[image * x_len..][..x_len], &weight, &bias, &mut y_alone, &mut scratch);
                 conv.backward_input(1, &dy[image * y_len..][..y_len], &weight, &mut dx_alone, &mut scratch);
-                assert!(y_alone == y[image * y_len..][..y_len], "{} forward {image} {shape:?}", isa.name());
-                assert!(dx_alone == dx[image * x_len..][..x_len], "{} gradient {image} {shape:?}", isa.name());
+                assert!(y_alone == y[image * y_len..][..y_len], "{backend:?} forward {image} {shape:?}");
+                assert!(dx_alone == dx[image * x_len..][..x_len], "{backend:?} gradient {image} {shape:?}");
             }
         }
     }
 }
 
 #[test]
-fn patches_and_products_make_the_same_convolution() {
-    let mut failures = Failures::default();
+fn columns_are_what_each_tap_sees_and_go_back_to_where_they_came_from() {
     for case in CASES {
-        let shape = shape(case);
-        let (taps, pixels) = (shape.c * shape.kh * shape.kw, shape.out_h() * shape.out_w());
-        let (x, dy) = (numbers(3, shape.c * shape.h * shape.w), numbers(4, shape.oc * pixels));
-        let weight = numbers(1, shape.oc * taps);
-        let (mut y, mut dx) = (nans(shape.oc * pixels), nans(x.len()));
-        reference::conv_forward(&shape, 1, &x, &weight, &vec![0.0; shape.oc], &mut y);
-        reference::conv_backward_input(&shape, 1, &dy, &weight, &mut dx);
-        for isa in isas() {
-            let mut patches = nans(pixels * taps);
-            im2col(&shape, &x, &mut patches);
-            let (m, k, n) = (shape.oc, taps, pixels);
-            let (mut actual, scratch) = (nans(m * n), &mut nans(gemm_scratch_len(m, k, n)));
-            gemm(isa, m, k, n, 1.0, &weight, (k, 1), &patches, (1, k), 0.0, &mut actual, (n, 1), scratch);
-            failures.compare(&format!("im2col {} {shape:?}", isa.name()), &actual, &y, 1e-5);
-
-            let (m, k, n) = (pixels, shape.oc, taps);
-            let scratch = &mut nans(gemm_scratch_len(m, k, n));
-            gemm(isa, m, k, n, 1.0, &dy, (1, m), &weight, (n, 1), 0.0, &mut patches, (n, 1), scratch);
-            let mut actual = vec![0.0; x.len()];
-            col2im(&shape, &patches, &mut actual);
-            failures.compare(&format!("col2im {} {shape:?}", isa.name()), &actual, &dx, 1e-5);
+        let s = shape(case);
+        let (taps, pixels) = (s.c * s.kh * s.kw, s.out_h() * s.out_w());
+        let x = numbers(3, s.c * s.h * s.w);
+        let mut columns = nans(taps * pixels);
+        im2col(&s, &x, &mut columns);
+        let (values, mut back) = (numbers(4, columns.len()), vec![0.0; x.len()]);
+        col2im(&s, &values, &mut back);
+        let mut expected = vec![0.0; x.len()];
+        for (at, (&actual, &value)) in columns.iter().zip(&values).enumerate() {
+            let (tap, pixel) = (at / pixels, at % pixels);
+            let (c, ky, kx) = (tap / s.kw / s.kh, tap / s.kw % s.kh, tap % s.kw);
+            let (iy, ix) = (pixel / s.out_w() * s.stride_h + ky, pixel % s.out_w() * s.stride_w + kx);
+            let inside = (s.pad_top..s.pad_top + s.h).contains(&iy) && (s.pad_left..s.pad_left + s.w).contains(&ix);
+            let index = inside.then(|| (c * s.h + iy - s.pad_top) * s.w + ix - s.pad_left);
+            assert_eq!(actual, index.map_or(0.0, |index| x[index]), "tap {tap}, output {pixel} of {s:?}");
+            index.into_iter().for_each(|index| expected[index] += value);
         }
+        let mut failures = Failures::default();
+        failures.compare(&format!("col2im {s:?}"), &back, &expected, 1e-6);
+        failures.report();
     }
-    failures.report();
 }

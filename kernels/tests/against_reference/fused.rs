@@ -150,8 +150,8 @@ fn gradients_behind_a_pooling_agree_with_those_of_the_whole_map() {
             let pool_shape = pool::PoolShape { c: oc, h: out_h, w: out_w, kh: 4, kw: 4, stride_h: 4, stride_w: 4 };
             let pooled = n * oc * pool_shape.out_h() * pool_shape.out_w();
             let (map, dpooled) = (numbers(1, n * oc * out_h * out_w), numbers(2, pooled));
-            let (mut y, mut expected, mut places) = (nans(pooled), nans(pooled), vec![u32::MAX; pooled]);
-            pool::max_forward_with_places(isa, &pool_shape, n, w, &map, &mut y, &mut places);
+            let (mut y, mut expected, mut argmax) = (nans(pooled), nans(pooled), vec![u32::MAX; pooled]);
+            pool::max_forward_with_argmax(isa, &pool_shape, n, w, &map, &mut y, &mut argmax);
             reference::max_forward(&pool_shape, n, &map, &mut expected);
             failures.compare(&format!("maximum {what}"), &y, &expected, 0.0);
             let mut dmap = nans(map.len());
@@ -165,8 +165,8 @@ fn gradients_behind_a_pooling_agree_with_those_of_the_whole_map() {
             reference::conv_backward_input(&shape, n, &dmap, &weight, &mut dx);
             let conv = Conv::new(shape, isa);
             assert!(conv.has_sparse_gradients());
-            conv.sparse_backward_weight(n, &x, &places, &dpooled, &mut actual_dweight, &mut actual_dbias);
-            conv.sparse_backward_input(n, &places, &dpooled, &weight, &mut actual_dx);
+            conv.sparse_backward_weight(n, &x, &argmax, &dpooled, &mut actual_dweight, &mut actual_dbias);
+            conv.sparse_backward_input(n, &argmax, &dpooled, &weight, &mut actual_dx);
             failures.compare(&format!("weight {what}"), &actual_dweight, &dweight, 1e-5);
             failures.compare(&format!("bias {what}"), &actual_dbias, &dbias, 1e-5);
             failures.compare(&format!("input {what}"), &actual_dx, &dx, 1e-5);

@@ -2,7 +2,8 @@
 
 use super::suspicious::Suspicion;
 use super::{Pictures, Report, Steering};
-use crate::dataset::recording::{Camera, Kind, Reason};
+use crate::dataset::recording::{Kind, View};
+use crate::dataset::unusable::Reason;
 
 /// Share of labels that are exactly zero above which straight frames crowd out the bends.
 pub(crate) const MANY_ZEROS: f64 = 0.35;
@@ -115,7 +116,7 @@ fn about_rows(report: &Report, advice: &mut Vec<String>) {
             100.0 * share
         ));
     }
-    if report.kind == Kind::Udacity && report.usable > 0 && !report.cameras.contains(&Camera::Left) {
+    if report.kind == Kind::Udacity && report.usable > 0 && !report.cameras.contains(&View::Left) {
         advice.push("no side cameras: a car off its line is never seen, so record ways back to it".into());
     }
     if report.gaps.count as f64 > 0.01 * report.usable as f64 && report.gaps.count > 2 {

@@ -5,8 +5,10 @@ use std::hash::{DefaultHasher, Hash, Hasher};
 
 use rayon::prelude::*;
 
-use super::super::decode::{RgbImage, decode_rgb};
-use super::super::recording::{Camera, Recording};
+use crate::Result;
+use crate::dataset::recording::{Recording, View};
+use crate::observer::{Observer, Progress, Tally};
+use crate::picture::{RgbImage, decode::decode_rgb};
 
 /// Rows that a thread looks at in one go.
 const CHUNK: usize = 128;
@@ -40,20 +42,23 @@ pub struct Frame {
     pub copy_of: Option<usize>,
 }
 
-/// Looks at the centre image of every row; `None` where it cannot be read. `progress` is told the share that is done.
-pub fn look(recording: &Recording, progress: &(dyn Fn(f64) + Sync)) -> Vec<Option<Frame>> {
+/// Looks at the centre image of every row; `None` where it cannot be read. `observer` is told the share that is done.
+///
+/// # Errors
+///
+/// The observer's own.
+pub fn look(recording: &Recording, observer: &mut (dyn Observer<Progress> + Send)) -> Result<Vec<Option<Frame>>> {
     let rows = recording.rows.len();
-    let done = std::sync::atomic::AtomicUsize::new(0);
+    let tally = Tally::new(rows, observer);
     let chunks: Vec<usize> = (0..rows).step_by(CHUNK).collect();
     let looked: Vec<Vec<Option<(u64, Frame)>>> = chunks
         .into_par_iter()
         .map(|first| {
             let found = look_at(recording, first, (first + CHUNK).min(rows));
-            let done = done.fetch_add(found.len(), std::sync::atomic::Ordering::Relaxed) + found.len();
-            progress(done as f64 / rows as f64);
-            found
+            tally.add(found.len())?;
+            Ok(found)
         })
-        .collect();
+        .collect::<Result<_>>()?;
     let mut seen = HashMap::new();
     let marked = looked.into_iter().flatten().enumerate().map(|(row, found)| {
         found.map(|(hash, frame)| match *seen.entry(hash).or_insert(row) {
@@ -61,7 +66,7 @@ pub fn look(recording: &Recording, progress: &(dyn Fn(f64) + Sync)) -> Vec<Optio
             _ => frame,
         })
     });
-    marked.collect()
+    Ok(marked.collect())
 }
 
 /// The frames of the rows from `first` to before `end`, with hashes of their files.
@@ -129,7 +134,7 @@ struct Eye {
 impl Eye {
     fn look(&mut self, recording: &Recording, row: usize) -> Option<Sketch> {
         use std::io::Read as _;
-        let path = recording.image_path(row, Camera::Centre)?;
+        let path = recording.image_path(row, View::Centre)?;
         self.file.clear();
         std::fs::File::open(path).ok()?.read_to_end(&mut self.file).ok()?;
         decode_rgb(&self.file, &mut self.image).ok()?;
@@ -200,6 +205,7 @@ pub(super) fn peak_offset([left, middle, right]: [f64; 3]) -> f64 {
 mod tests {
     use super::*;
     use crate::dataset::testing::{jpeg_of, recording_of};
+    use crate::observer::Unobserved;
 
     fn scene(shift: f64) -> Vec<f32> {
         let level = |i: usize| {
@@ -244,7 +250,7 @@ mod tests {
         std::fs::write(folder.path().join("driving_log.csv"), log).unwrap();
         let recording = crate::dataset::load(folder.path()).unwrap();
         assert_eq!(recording.rows.len(), 6);
-        let frames: Vec<Frame> = look(&recording, &|_| ()).into_iter().map(Option::unwrap).collect();
+        let frames: Vec<Frame> = look(&recording, &mut Unobserved).unwrap().into_iter().map(Option::unwrap).collect();
         let turn = f64::from(frames[0].turn.unwrap());
         assert!((turn - 8.0 / 320.0 / 0.1).abs() < 0.02, "{turn}");
         assert!(frames[2].turn.unwrap().abs() < 0.01);
@@ -255,6 +261,6 @@ mod tests {
 
     #[test]
     fn images_that_are_not_there_are_left_out() {
-        assert_eq!(look(&recording_of(&[0.0, 0.1], 100), &|_| ()), [None, None]);
+        assert_eq!(look(&recording_of(&[0.0, 0.1], 100), &mut Unobserved).unwrap(), [None, None]);
     }
 }

@@ -7,8 +7,8 @@
 
 use serde::Serialize;
 
-use super::super::recording::Recording;
 use super::frames::{Frame, peak_offset};
+use crate::dataset::recording::Recording;
 
 /// Largest lag that is looked for, in seconds.
 const REACH_S: f64 = 1.0;

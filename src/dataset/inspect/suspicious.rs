@@ -4,10 +4,10 @@ use std::ops::Range;
 
 use serde::Serialize;
 
-use super::super::recording::Recording;
 use super::FULL_LOCK;
 use super::frames::Frame;
 use super::lag::Lag;
+use crate::dataset::recording::Recording;
 
 /// A car slower than this stands, mph.
 pub const STANDING_MPH: f32 = 1.0;

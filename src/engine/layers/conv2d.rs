@@ -1,7 +1,7 @@
 //! 2-D convolution.
 
 use serde::{Deserialize, Serialize};
-use steersman_kernels::Isa;
+use steersman_kernels::Backend;
 use steersman_kernels::conv::{Conv, ConvShape};
 
 use super::{Grads, Layer, Linear, Pair, ParamSpec, Pass, Prepared};
@@ -56,7 +56,7 @@ impl Conv2d {
         stride: [usize; 2],
         padding: Padding,
         init: Initializer,
-        isa: Isa,
+        backend: impl Into<Backend>,
     ) -> Result<Conv2d, String> {
         let [kh, kw] = kernel;
         let [stride_h, stride_w] = stride;
@@ -82,7 +82,7 @@ impl Conv2d {
             pad_left,
             pad_right,
         };
-        Ok(Conv2d { conv: Conv::new(shape, isa), shape, init })
+        Ok(Conv2d { conv: Conv::new(shape, backend), shape, init })
     }
 
     /// The kernel that computes it.
@@ -194,6 +194,9 @@ impl Linear for Conv2d {
 
 #[cfg(test)]
 mod tests {
+    use steersman_kernels::Isa;
+    use steersman_kernels::conv::ConvAlgorithm;
+
     use super::super::gradcheck::check_layer;
     use super::*;
 
@@ -203,14 +206,16 @@ mod tests {
         kernel: [usize; 2],
         stride: [usize; 2],
         padding: Padding,
-        isa: Isa,
+        backend: impl Into<Backend>,
     ) -> Conv2d {
-        Conv2d::new(Shape::new(c, h, w), filters, kernel, stride, padding, Initializer::GlorotUniform, isa).unwrap()
+        Conv2d::new(Shape::new(c, h, w), filters, kernel, stride, padding, Initializer::GlorotUniform, backend).unwrap()
     }
 
     #[test]
     fn gradients_hold_for_odd_sizes_strides_and_paddings() {
-        for isa in Isa::available() {
+        let auto = Isa::available().into_iter().map(Backend::from);
+        let im2col = Backend { isa: Isa::PORTABLE, conv: ConvAlgorithm::Im2col };
+        for backend in auto.chain([im2col]) {
             for padding in [Padding::Valid, Padding::Same] {
                 for (n, input, filters, kernel, stride) in [
                     (1, [1, 3, 3], 1, [3, 3], [1, 1]),
@@ -222,7 +227,7 @@ mod tests {
                     (2, [2, 5, 6], 3, [2, 4], [1, 3]),
                     (1, [2, 3, 40], 8, [3, 3], [1, 1]),
                 ] {
-                    check_layer(&conv(input, filters, kernel, stride, padding, isa), n);
+                    check_layer(&conv(input, filters, kernel, stride, padding, backend), n);
                 }
             }
         }

@@ -2,6 +2,7 @@
 
 use steersman_kernels::Isa;
 use steersman_kernels::gemm::{gemm, gemm_scratch_len};
+use steersman_kernels::matrix::{Matrix, MatrixMut};
 
 use super::{Grads, Layer, Linear, Pair, ParamSpec, Pass};
 use crate::engine::tensor::{Fans, Initializer, Shape};
@@ -63,7 +64,8 @@ impl Layer for Dense {
         for row in y[..n * units].chunks_exact_mut(units) {
             row.copy_from_slice(bias);
         }
-        gemm(self.isa, n, inputs, units, 1.0, x, (inputs, 1), weight, (1, inputs), 1.0, y, (units, 1), scratch);
+        let (x, weight) = (Matrix::new(x, n, inputs), Matrix::new(weight, units, inputs));
+        gemm(self.isa, 1.0, x, weight.transposed(), 1.0, MatrixMut::new(y, n, units), scratch);
     }
 
     fn forward(&self, params: &[f32], _pass: &Pass, n: usize, x: &[f32], y: &mut [f32], scratch: &mut [f32]) {
@@ -75,7 +77,8 @@ impl Layer for Dense {
         let Grads { dparams, scratch } = grads;
         let (inputs, units) = (self.inputs, self.units);
         let (dweight, dbias) = dparams.split_at_mut(inputs * units);
-        gemm(self.isa, units, n, inputs, 1.0, dy, (1, units), x, (inputs, 1), 1.0, dweight, (inputs, 1), scratch);
+        let (dy_matrix, x) = (Matrix::new(dy, n, units), Matrix::new(x, n, inputs));
+        gemm(self.isa, 1.0, dy_matrix.transposed(), x, 1.0, MatrixMut::new(dweight, units, inputs), scratch);
         for row in dy[..n * units].chunks_exact(units) {
             for (sum, d) in dbias.iter_mut().zip(row) {
                 *sum += d;
@@ -95,7 +98,8 @@ impl Linear for Dense {
     fn backward_input(&self, params: &[f32], _pass: &Pass, n: usize, dy: &[f32], dx: &mut [f32], scratch: &mut [f32]) {
         let (inputs, units) = (self.inputs, self.units);
         let weight = &params[..inputs * units];
-        gemm(self.isa, n, units, inputs, 1.0, dy, (units, 1), weight, (inputs, 1), 0.0, dx, (inputs, 1), scratch);
+        let (dy, weight) = (Matrix::new(dy, n, units), Matrix::new(weight, units, inputs));
+        gemm(self.isa, 1.0, dy, weight, 0.0, MatrixMut::new(dx, n, inputs), scratch);
     }
 }
 

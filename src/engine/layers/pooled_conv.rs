@@ -73,7 +73,7 @@ impl PooledConv {
         let outputs = y.chunks_exact_mut(self.output_len()).zip(starts.chunks_exact_mut(self.output_len()));
         for (x, (y, starts)) in x.chunks_exact(input.len()).zip(outputs).take(n) {
             self.kernel().forward_packed(1, x, pass.prepared, map, scratch);
-            pool::max_forward_with_places(self.isa, &self.pool, 1, input.w, map, pooled, starts);
+            pool::max_forward_with_argmax(self.isa, &self.pool, 1, input.w, map, pooled, starts);
             self.activate(pooled, y);
         }
     }

@@ -18,7 +18,7 @@ use std::ops::Range;
 pub use inference::InferencePlan;
 pub use observation::ObservationPlan;
 pub use spec::LayerSpec;
-use steersman_kernels::Isa;
+use steersman_kernels::{Backend, Isa};
 pub use step_profile::StageTime;
 pub(crate) use training::CHUNK;
 pub use training::{StepInput, TrainingPlan};
@@ -35,7 +35,7 @@ pub struct Network {
     input: Shape,
     layers: Vec<NamedLayer>,
     tensors: Vec<Tensor>,
-    isa: Isa,
+    backend: Backend,
 }
 
 /// A layer and where its tensors lie in [`Parameters`].
@@ -94,19 +94,21 @@ impl Parameters {
 }
 
 impl Network {
-    /// The network of `specs` over images of `input`, with the vector code of `isa`.
+    /// The network of `specs` over images of `input`, computed with `backend`: an [`Isa`], or one with a convolution algorithm.
     ///
     /// # Errors
     ///
     /// [`Error::Network`] names the first layer that does not fit and says why.
-    pub fn new(input: Shape, specs: &[LayerSpec], isa: Isa) -> Result<Network> {
-        let mut network = Network { input, layers: Vec::new(), tensors: Vec::new(), isa };
+    pub fn new(input: Shape, specs: &[LayerSpec], backend: impl Into<Backend>) -> Result<Network> {
+        let backend = backend.into();
+        let mut network = Network { input, layers: Vec::new(), tensors: Vec::new(), backend };
         let (mut params_end, mut statistics_end) = (0, 0);
         for (index, spec) in specs.iter().enumerate() {
             let same_kind = specs[..index].iter().filter(|other| other.base_name() == spec.base_name()).count();
             let name = format!("{}{}", spec.base_name(), same_kind + 1);
-            let layer =
-                spec.build(network.output(), isa).map_err(|message| Error::Network { layer: name.clone(), message })?;
+            let layer = spec
+                .build(network.output(), backend)
+                .map_err(|message| Error::Network { layer: name.clone(), message })?;
             let (params_start, statistics_start) = (params_end, statistics_end);
             for (specs, end, trainable) in
                 [(layer.params(), &mut params_end, true), (layer.statistics(), &mut statistics_end, false)]
@@ -158,7 +160,12 @@ impl Network {
 
     /// The vector code the network runs on.
     pub fn isa(&self) -> Isa {
-        self.isa
+        self.backend.isa
+    }
+
+    /// What the network is computed with.
+    pub fn backend(&self) -> Backend {
+        self.backend
     }
 
     /// Freezes the layers called `names`: training leaves their parameters and running statistics as they are, and batch

@@ -1,7 +1,7 @@
 //! What a recipe says of a layer, and how it becomes one.
 
 use serde::{Deserialize, Serialize};
-use steersman_kernels::Isa;
+use steersman_kernels::Backend;
 
 use crate::engine::layers::{
     AveragePool, BatchNorm, Conv2d, Crop, Dense, Dropout, Elu, Flatten, Layer, LeakyRelu, MaxPool, PRelu, Padding,
@@ -262,12 +262,14 @@ impl LayerSpec {
     }
 
     /// The layer for inputs of shape `input`, or what does not fit.
-    pub fn build(&self, input: Shape, isa: Isa) -> Result<Box<dyn Layer>, String> {
+    pub fn build(&self, input: Shape, backend: impl Into<Backend>) -> Result<Box<dyn Layer>, String> {
+        let backend = backend.into();
+        let isa = backend.isa;
         self.check_sizes(input)?;
         self.check_first_values()?;
         Ok(match *self {
             LayerSpec::Conv2d { filters, kernel, stride, padding, init } => {
-                Box::new(Conv2d::new(input, filters, kernel, stride, padding, init, isa)?)
+                Box::new(Conv2d::new(input, filters, kernel, stride, padding, init, backend)?)
             }
             LayerSpec::BatchNorm { epsilon, running_old_weight } => {
                 Box::new(BatchNorm::new(input, epsilon, running_old_weight, isa)?)

@@ -168,7 +168,7 @@ fn pooled_conv(network: &Network, layers: &[NamedLayer]) -> Option<PooledConv> {
     };
     let LayerSpec::MaxPool { window: [4, 4], stride: None | Some([4, 4]) } = pool.spec else { return None };
     let isa = network.isa();
-    let conv = Conv2d::new(conv.layer.input(), filters, kernel, stride, padding, init, isa).ok()?;
+    let conv = Conv2d::new(conv.layer.input(), filters, kernel, stride, padding, init, network.backend()).ok()?;
     PooledConv::new(conv, activation, isa)
 }
 

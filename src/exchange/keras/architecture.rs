@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use serde_json::{Map, Value};
 
-use super::Problem;
+use super::messages::Problem;
 
 /// One layer of the chain.
 #[derive(Clone, Debug, PartialEq)]

@@ -7,8 +7,9 @@ use steersman_kernels::Isa;
 
 use super::architecture::KerasLayer;
 use super::file::Tensor;
+use super::limits::check_size;
+use super::messages::{Problem, shown};
 use super::translate::{AxisOrder, KernelLayout, Operation, Step};
-use super::{Problem, check_size, shown};
 use crate::engine::layers::Slopes;
 use crate::engine::network::{LayerSpec, Parameters};
 use crate::engine::tensor::{Initializer, Shape};

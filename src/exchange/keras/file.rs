@@ -11,7 +11,8 @@ use hdf5_reader::{Attribute, Dataset, Hdf5File, OpenOptions, group::Group};
 use serde::Deserialize;
 
 use super::architecture::KerasLayer;
-use super::{MAX_JSON_BYTES, shown, shown_list};
+use super::limits::MAX_JSON_BYTES;
+use super::messages::{shown, shown_list};
 use crate::error::{Error, Result};
 
 /// Larger files are refused: networks that steer have megabytes.

@@ -11,7 +11,9 @@ mod architecture;
 mod assemble;
 mod file;
 mod lambda;
+mod limits;
 mod marshal;
+mod messages;
 mod translate;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -23,6 +25,8 @@ use steersman_kernels::Isa;
 use self::assemble::{Assembly, Context};
 use self::file::KerasFile;
 use self::lambda::Affine;
+use self::limits::{MAX_JSON_BYTES, check_size};
+use self::messages::{Problem, listed, shown};
 use self::translate::{AxisOrder, Operation, Step};
 use crate::dataset::preprocess::Preprocessing;
 use crate::engine::network::{LayerSpec, Network, Parameters};
@@ -119,14 +123,6 @@ pub struct LayerReport {
     pub becomes: Vec<String>,
 }
 
-/// Why a layer cannot be imported.
-#[derive(Clone, Debug, PartialEq)]
-struct Problem {
-    layer: String,
-    class: String,
-    reason: String,
-}
-
 /// Reads the model in `path`.
 ///
 /// # Errors
@@ -202,68 +198,12 @@ pub fn import(path: &Path, options: &ImportOptions) -> Result<Imported> {
     Ok(Imported { input, layers: specs, parameters, keras_version: file.keras_version, report, notices })
 }
 
-/// Longer JSON is refused: architectures are kilobytes long, and parsed, each number of a hostile one takes 36 times its length.
-const MAX_JSON_BYTES: usize = 1 << 20;
-
-/// Highest number of rows and columns of a map, and of its numbers in all; their products stay far from overflowing.
-const MAX_SIDE: usize = 8192;
-const MAX_MAP: usize = 1 << 26;
-
-/// Whether maps of `shape` are small enough to be computed with.
-fn check_size(shape: Shape) -> Result<(), String> {
-    let Shape { c, h, w } = shape;
-    if h.max(w) > MAX_SIDE || c.saturating_mul(h).saturating_mul(w) > MAX_MAP {
-        return Err(format!(
-            "a map of {h}x{w}x{c} is too large: up to {MAX_SIDE} rows and columns and {MAX_MAP} numbers in all can be imported"
-        ));
-    }
-    Ok(())
-}
-
-/// Characters of a text from the file, and entries of a list of them, that messages show.
-const SHOWN_CHARS: usize = 100;
-const SHOWN_ENTRIES: usize = 20;
-
-/// A text from the file, fit for a message: short, and without characters that a terminal obeys.
-fn shown(text: &str) -> String {
-    let mut chars = text.chars().filter(|c| !c.is_control());
-    let mut short: String = chars.by_ref().take(SHOWN_CHARS).collect();
-    if chars.next().is_some() {
-        short.push('…');
-    }
-    short
-}
-
-/// Names from the file in one line.
-fn shown_list<'a>(names: impl ExactSizeIterator<Item = &'a str>) -> String {
-    let more = names.len().saturating_sub(SHOWN_ENTRIES);
-    let mut text = names.take(SHOWN_ENTRIES).map(shown).collect::<Vec<_>>().join(", ");
-    if more > 0 {
-        text += &format!(" and {more} more");
-    }
-    text
-}
-
 fn read_architecture(path: &Path) -> Result<String> {
     let len = std::fs::metadata(path).map_err(Error::io(path))?.len();
     if len > MAX_JSON_BYTES as u64 {
         return Err(Error::data(path, format!("has {len} bytes, which is no architecture")));
     }
     std::fs::read_to_string(path).map_err(Error::io(path))
-}
-
-fn listed(problems: &[Problem]) -> String {
-    let mut text = match problems.len() {
-        1 => "a layer cannot be imported:".to_string(),
-        count => format!("{count} layers cannot be imported:"),
-    };
-    for Problem { layer, class, reason } in problems.iter().take(SHOWN_ENTRIES) {
-        text += &format!("\n  {} ({}): {reason}", shown(layer), shown(class));
-    }
-    if let Some(more) = problems.len().checked_sub(SHOWN_ENTRIES).filter(|more| *more > 0) {
-        text += &format!("\n  and {more} more");
-    }
-    text
 }
 
 /// The order of axes that all layers of the chain agree on.

@@ -4,7 +4,7 @@ use serde_json::{Map, Value};
 
 use super::architecture::KerasLayer;
 use super::lambda::{self, Affine};
-use super::shown;
+use super::messages::shown;
 use crate::engine::layers::Padding;
 use crate::engine::network::LayerSpec;
 use crate::engine::tensor::Initializer;

@@ -2,28 +2,31 @@
 
 use std::path::Path;
 
-use super::panel::{Names, Panel, Scene};
-use super::{Onlooker, Video, VideoSummary};
-use crate::dataset::decode::RgbImage;
+use super::film::Video;
+use super::onlooker::Onlooker;
+use super::painter::{Captions, FilmFrame, Painter};
+use super::summary::VideoSummary;
 use crate::error::{Error, Result};
+use crate::observer::{Observer, Progress};
+use crate::picture::RgbImage;
 use crate::simulator::car::dynamics::MAX_STEER_DEG;
-use crate::simulator::trial::run::{DRIVE_HZ, Failure};
-use crate::simulator::{DriveFrame, DriveObserver, Driver, HEIGHT, Run, RunOptions, Track, WIDTH, run_observed};
+use crate::simulator::trial::outcome::{DRIVE_HZ, Failure};
+use crate::simulator::{DriveEvent, DriveFrame, Driver, HEIGHT, Track, Trial, TrialOptions, WIDTH, run_trial_observed};
 
 /// A video of a run that is yet to be driven.
 pub struct DriveVideo {
     video: Video,
-    scene: Scene,
+    frame: FilmFrame,
     /// Colours the picture, if that was asked for; steers nothing.
     onlooker: Option<Onlooker>,
 }
 
 /// Films while the run goes on.
-struct Filming<'a> {
+struct FilmObserver<'a> {
     film: &'a mut DriveVideo,
     /// Whether the driver looks at pictures, so that its time to answer means something.
     looks: bool,
-    progress: &'a mut dyn FnMut(f64) -> bool,
+    observer: &'a mut dyn Observer<Progress>,
 }
 
 impl DriveVideo {
@@ -36,18 +39,18 @@ impl DriveVideo {
     pub fn create(
         path: &Path,
         track: &Track,
-        names: Names,
+        names: Captions,
         fps: Option<f64>,
         onlooker: Option<Onlooker>,
     ) -> Result<DriveVideo> {
-        let video = Video::create(path, Panel::new(names, Some(track)), fps.unwrap_or(DRIVE_HZ as f64))?;
-        let scene = Scene { picture: RgbImage::filled(HEIGHT, WIDTH, [0; 3]), ..Scene::default() };
-        Ok(DriveVideo { video, scene, onlooker })
+        let video = Video::create(path, Painter::new(names, Some(track)), fps.unwrap_or(DRIVE_HZ as f64))?;
+        let frame = FilmFrame { picture: RgbImage::filled(HEIGHT, WIDTH, [0; 3]), ..FilmFrame::default() };
+        Ok(DriveVideo { video, frame, onlooker })
     }
 
-    /// Drives the run `seed`, as [`run`](crate::simulator::trial::run::run) does and to the same bits, and writes the video. `progress`
-    /// is told the share of the way that is made and may return `false` to stop; what there is by then is written, and the second
-    /// value is `true`.
+    /// Drives the run `seed`, as [`run`](crate::simulator::trial::run::run_trial) does and to the same bits, and writes the video. `observer`
+    /// is told the share of the way that is made. If it returns [`Error::Interrupted`], what there is by then is written, and the
+    /// second value is `true`.
     ///
     /// # Errors
     ///
@@ -56,12 +59,12 @@ impl DriveVideo {
         mut self,
         track: &Track,
         driver: &mut dyn Driver,
-        options: &RunOptions,
+        options: &TrialOptions,
         seed: u64,
-        progress: &mut dyn FnMut(f64) -> bool,
+        observer: &mut dyn Observer<Progress>,
     ) -> Result<(VideoSummary, bool)> {
         let looks = driver.needs_frame();
-        match run_observed(track, driver, options, seed, &mut Filming { film: &mut self, looks, progress }) {
+        match run_trial_observed(track, driver, options, seed, &mut FilmObserver { film: &mut self, looks, observer }) {
             Ok(run) => Ok((self.video.finish(&outcome(&run, options))?, false)),
             Err(Error::Interrupted) => Ok((self.video.finish("stopped")?, true)),
             Err(error) => Err(error),
@@ -69,34 +72,40 @@ impl DriveVideo {
     }
 }
 
-impl DriveObserver for Filming<'_> {
-    fn frame(&mut self, frame: &DriveFrame) -> Result<()> {
-        let DriveVideo { video, scene, onlooker } = &mut *self.film;
-        let simulation = frame.simulation;
-        scene.picture.pixels.clone_from(&frame.picture.pixels);
-        if let Some(onlooker) = onlooker {
-            onlooker.look(&mut scene.picture)?;
-        }
-        scene.time_s = simulation.time_s();
-        scene.model_deg = Some(frame.steering * MAX_STEER_DEG);
-        scene.reference_deg = Some(frame.expert_steering * MAX_STEER_DEG);
-        scene.speed_mph = Some(frame.speed_mph);
-        scene.cte_m = Some(simulation.cte_m());
-        scene.answered_in = self.looks.then_some(frame.answered_in);
-        scene.lap = Some((frame.lap(), Some(frame.options.laps)));
-        scene.place = Some([simulation.car.x, simulation.car.y]);
-        scene.put_back = frame.put_back;
-        video.show(scene)?;
-        let way_m = frame.options.laps as f64 * simulation.track.length_m;
-        match (self.progress)((simulation.progress_m / way_m).clamp(0.0, 1.0)) {
-            true => Ok(()),
-            false => Err(Error::Interrupted),
+impl<'e> Observer<DriveEvent<'e>> for FilmObserver<'_> {
+    fn observe(&mut self, event: DriveEvent<'e>) -> Result<()> {
+        match event {
+            DriveEvent::Begin { .. } => Ok(()),
+            DriveEvent::Frame(frame) => self.frame(frame),
         }
     }
 }
 
+impl FilmObserver<'_> {
+    fn frame(&mut self, driven: &DriveFrame) -> Result<()> {
+        let DriveVideo { video, frame, onlooker } = &mut *self.film;
+        let simulation = driven.simulation;
+        frame.picture.pixels.clone_from(&driven.picture.pixels);
+        if let Some(onlooker) = onlooker {
+            onlooker.look(&mut frame.picture)?;
+        }
+        frame.time_s = simulation.time_s();
+        frame.model_deg = Some(driven.steering * MAX_STEER_DEG);
+        frame.reference_deg = Some(driven.expert_steering * MAX_STEER_DEG);
+        frame.speed_mph = Some(driven.speed_mph);
+        frame.cte_m = Some(simulation.cte_m());
+        frame.answered_in = self.looks.then_some(driven.answered_in);
+        frame.lap = Some((driven.lap(), Some(driven.options.laps)));
+        frame.place = Some([simulation.car.x, simulation.car.y]);
+        frame.put_back = driven.put_back;
+        video.show(frame)?;
+        let way_m = driven.options.laps as f64 * simulation.track.length_m;
+        self.observer.observe(Progress((simulation.progress_m / way_m).clamp(0.0, 1.0)))
+    }
+}
+
 /// What a run came to, in a few words.
-fn outcome(run: &Run, options: &RunOptions) -> String {
+fn outcome(run: &Trial, options: &TrialOptions) -> String {
     let time_s = run.time_s;
     match run.failure {
         Some(Failure::Crash) => format!("hit a wall after {time_s:.1} s"),

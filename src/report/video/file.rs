@@ -8,10 +8,10 @@ use mp4::{AvcConfig, MediaConfig, Mp4Config, Mp4Sample, Mp4Writer, TrackConfig, 
 use rusty_h264_common::{Profile, YuvPlanes};
 use rusty_h264_encoder::{Encoder, EncoderConfig, Preset};
 
-use super::VideoSummary;
-use crate::dataset::decode::RgbImage;
+use super::summary::VideoSummary;
 use crate::error::{Error, Result};
 use crate::files::atomic_file::NewFile;
+use crate::picture::RgbImage;
 
 /// Ticks of the file's clock in a second.
 const TICKS_PER_S: u32 = 90_000;

@@ -2,19 +2,22 @@
 
 use std::path::Path;
 
-use super::panel::{Names, Panel, Scene};
-use super::{Onlooker, Video, VideoSummary};
-use crate::dataset::decode::decode_rgb;
-use crate::dataset::{self, Camera, Recording};
+use super::film::{Video, ended_early};
+use super::onlooker::Onlooker;
+use super::painter::{Captions, FilmFrame, Painter};
+use super::summary::VideoSummary;
+use crate::dataset::{self, Recording, View};
 use crate::error::{Error, Result};
+use crate::observer::{Observer, Progress};
+use crate::picture::decode::decode_rgb;
 use crate::simulator::car::dynamics::MAX_STEER_DEG;
 
 /// Pictures a second where no session has two rows.
 const LONE_ROW_HZ: f64 = 20.0;
 
 /// Writes the video of the recording `path` to the new file `out`: `fps` pictures a second, or as many as were recorded.
-/// Sessions follow each other without the time between them. `progress` is told the share that is done and may return `false`
-/// to stop; what there is by then is written, and the second value is `true`.
+/// Sessions follow each other without the time between them. `observer` is told the share that is done. If it
+/// returns [`Error::Interrupted`], what there is by then is written, and the second value is `true`.
 ///
 /// # Errors
 ///
@@ -24,20 +27,20 @@ pub fn film(
     out: &Path,
     mut onlooker: Option<Onlooker>,
     fps: Option<f64>,
-    progress: &mut dyn FnMut(f64) -> bool,
+    observer: &mut dyn Observer<Progress>,
 ) -> Result<(VideoSummary, bool)> {
     let recording = dataset::load(path)?;
     recording.require_usable()?;
     let full_lock_deg = onlooker.as_ref().map_or(MAX_STEER_DEG, Onlooker::full_lock_deg);
     let own = recording.rate_hz().unwrap_or(LONE_ROW_HZ);
-    let names = Names {
+    let names = Captions {
         title: name(path),
         subtitle: format!("recording, {} rows, {own:.3} Hz", recording.rows.len()).replace(".000", ""),
         model: onlooker.as_ref().map(|_| "model"),
         reference: "human",
     };
-    let mut video = Video::create(out, Panel::new(names, None), fps.unwrap_or(own.clamp(1.0, 60.0)))?;
-    let mut scene = Scene::default();
+    let mut video = Video::create(out, Painter::new(names, None), fps.unwrap_or(own.clamp(1.0, 60.0)))?;
+    let mut frame = FilmFrame::default();
     let mut session_begins_s = 0.0;
     let (mut stopped, mut unreadable) = (false, 0);
     'sessions: for session in &recording.sessions {
@@ -45,21 +48,21 @@ pub fn film(
         for row in session.clone() {
             let at = &recording.rows[row];
             // One bad picture does not cost the video; without any good one there is none.
-            if let Err(error) = read(&recording, row, &mut scene) {
+            if let Err(error) = read(&recording, row, &mut frame) {
                 unreadable += 1;
                 if unreadable == recording.rows.len() {
                     return Err(error);
                 }
                 continue;
             }
-            let looked = onlooker.as_mut().map(|onlooker| onlooker.look(&mut scene.picture)).transpose()?;
-            scene.time_s = session_begins_s + (at.time_ms - first_ms) as f64 / 1000.0;
-            scene.model_deg = looked.map(|(deg, _)| deg);
-            scene.answered_in = looked.map(|(_, took)| took);
-            scene.reference_deg = Some(f64::from(at.steering) * full_lock_deg);
-            scene.speed_mph = Some(f64::from(at.speed_mph)).filter(|mph| mph.is_finite());
-            video.show(&scene)?;
-            if !progress((row + 1) as f64 / recording.rows.len() as f64) {
+            let looked = onlooker.as_mut().map(|onlooker| onlooker.look(&mut frame.picture)).transpose()?;
+            frame.time_s = session_begins_s + (at.time_ms - first_ms) as f64 / 1000.0;
+            frame.model_deg = looked.map(|(deg, _)| deg);
+            frame.answered_in = looked.map(|(_, took)| took);
+            frame.reference_deg = Some(f64::from(at.steering) * full_lock_deg);
+            frame.speed_mph = Some(f64::from(at.speed_mph)).filter(|mph| mph.is_finite());
+            video.show(&frame)?;
+            if ended_early(observer.observe(Progress((row + 1) as f64 / recording.rows.len() as f64)))? {
                 stopped = true;
                 break 'sessions;
             }
@@ -77,10 +80,10 @@ fn name(path: &Path) -> String {
     folder.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
 }
 
-fn read(recording: &Recording, row: usize, scene: &mut Scene) -> Result<()> {
-    let path = recording.image_path(row, Camera::Centre);
+fn read(recording: &Recording, row: usize, frame: &mut FilmFrame) -> Result<()> {
+    let path = recording.image_path(row, View::Centre);
     let path =
         path.ok_or_else(|| Error::data(&recording.path, format!("row {row} has no picture of the centre camera")))?;
     let bytes = std::fs::read(&path).map_err(Error::io(&path))?;
-    decode_rgb(&bytes, &mut scene.picture).map_err(|message| Error::data(&path, message))
+    decode_rgb(&bytes, &mut frame.picture).map_err(|message| Error::data(&path, message))
 }

@@ -1,33 +1,33 @@
-//! What is due on a connection apart from messages: greetings, pings, and what follows silence.
+//! The deadlines of a connection: greeting, pings, and what follows silence.
 
 use std::time::{Duration, Instant};
 
-use super::{Connection, End, QUICK_BEAT, SLOW_BEAT, session_id};
-use crate::serve::journal::Event;
-use crate::serve::protocol::{self, EngineVersion, PING_INTERVAL_MS, PING_TIMEOUT_MS};
-use crate::serve::registry::Stage;
+use super::{Connection, End, QUICK_TICK, SLOW_TICK, session_id};
+use crate::net::connections::Rank;
+use crate::serve::journal::Incident;
+use crate::udacity::{self, EngineVersion, PING_INTERVAL_MS, PING_TIMEOUT_MS};
 
-/// Time that an unknown client has for telemetry before it gets the handshake of Socket.IO.
+/// Time without telemetry after which an unknown client gets the handshake of Socket.IO.
 const GREETING_TIME: Duration = Duration::from_millis(50);
-/// Telemetry is stale after this time: the throttle is cut.
+/// Age at which telemetry is stale, and the throttle is cut.
 const STALE_TIME: Duration = Duration::from_millis(500);
-/// Telemetry is asked for after this time without any, and again each time it passes.
+/// Time without telemetry after which the server asks for it, again and again.
 const ASK_TIME: Duration = Duration::from_secs(1);
-/// After this time a client without telemetry is talked about.
+/// Time without telemetry after which the server tells the user.
 const MISSING_TIME: Duration = Duration::from_secs(5);
-/// A client that answers no ping, or never was of use, is given up after this time without a complete message.
-const SILENCE_LIMIT: Duration = Duration::from_millis(PING_INTERVAL_MS + PING_TIMEOUT_MS);
+/// Longest time without a complete message, for a client that is not driven or does not answer pings.
+const MAX_SILENCE: Duration = Duration::from_millis(PING_INTERVAL_MS + PING_TIMEOUT_MS);
 
-impl Connection<'_> {
-    /// What is due apart from messages.
-    pub(super) fn after_beat(&mut self) -> Result<(), End> {
+impl Connection<'_, '_> {
+    /// Does what is due after each tick, apart from messages.
+    pub(super) fn after_tick(&mut self) -> Result<(), End> {
         if let Some((text, came)) = self.held.take() {
             if self.may_answer() {
-                // Waiting for another client to leave is no delay of the answer, and no silence of this one.
+                // The time that it waited for another client to leave counts neither as latency nor as silence.
                 let now = Instant::now();
                 let came = if self.waits { now } else { came };
                 self.last_telemetry = Some(now);
-                if let Ok(packet) = protocol::parse(&text) {
+                if let Ok(packet) = udacity::parse(&text) {
                     self.answer(packet, came)?;
                 }
             } else {
@@ -41,46 +41,46 @@ impl Connection<'_> {
         self.keep_alive(now)?;
         match self.last_telemetry {
             None => self.miss_telemetry(now)?,
-            // A client that waits for its answer or for another to leave is not silent.
+            // A client that waits for its answer or for another client to leave is not silent.
             Some(_) if self.lockstep || self.held.is_some() => {}
             Some(last) => {
                 let silent = now.saturating_duration_since(last);
-                if self.peer.stage() == Stage::Trusted && !self.overridden {
+                if self.peer.rank() == Rank::InUse && !self.overridden {
                     self.watch(silent, now)?;
                 } else {
-                    self.ask_again(silent, now, Event::Silent)?;
+                    self.ask_again(silent, now, Incident::Silent)?;
                 }
             }
         }
-        let quick = self.peer.stage() == Stage::Trusted
+        let quick = self.peer.rank() == Rank::InUse
             || self.held.is_some()
             || now.duration_since(self.opened) < 4 * GREETING_TIME;
-        self.websocket.get_mut().set_beat(if quick { QUICK_BEAT } else { SLOW_BEAT })?;
+        self.websocket.get_mut().set_tick(if quick { QUICK_TICK } else { SLOW_TICK })?;
         Ok(())
     }
 
-    /// The handshake of Socket.IO for a client that seems to wait for it.
+    /// Sends the handshake of Socket.IO to a client that seems to wait for it.
     fn greet(&mut self, now: Instant) -> Result<(), End> {
         if !self.greeted && now.duration_since(self.opened) >= GREETING_TIME {
             self.greeted = true;
             let version = self.client.version;
             let sid = session_id(self.peer.id);
-            self.send(|out| protocol::print_open(out, version, &sid))?;
+            self.send(|out| udacity::print_open(out, version, &sid))?;
             if version == EngineVersion::V3 {
-                self.send(|out| protocol::print_connected(out, version, &sid))?;
+                self.send(|out| udacity::print_connected(out, version, &sid))?;
             }
             self.last_ping = now;
         }
         Ok(())
     }
 
-    /// Pings of Engine.IO 4 come from the server; whoever drives by another protocol pings by itself. So a stranger that
-    /// completes no message for as long as that is nobody.
+    /// Sends the pings of Engine.IO 4 and closes silent clients. In the other protocols the client pings, so every real client
+    /// completes a message now and then.
     fn keep_alive(&mut self, now: Instant) -> Result<(), End> {
-        let silent = now.duration_since(self.last_message) > SILENCE_LIMIT;
-        if silent && self.peer.stage() != Stage::Trusted {
-            let text = format!("no complete message for {} s", SILENCE_LIMIT.as_secs());
-            return Err(End::Fault(Event::TooSlow, text));
+        let silent = now.duration_since(self.last_message) > MAX_SILENCE;
+        if silent && self.peer.rank() != Rank::InUse {
+            let text = format!("no complete message for {} s", MAX_SILENCE.as_secs());
+            return Err(End::Fault(Incident::TooSlow, text));
         }
         if !self.greeted || self.client.version == EngineVersion::V3 {
             return Ok(());
@@ -90,12 +90,12 @@ impl Connection<'_> {
             self.send(|out| out.push('2'))?;
         }
         if silent {
-            return Err(End::Fault(Event::TooSlow, "no answer to pings".into()));
+            return Err(End::Fault(Incident::TooSlow, "no answer to pings".into()));
         }
         Ok(())
     }
 
-    /// A client without telemetry is asked for it, if it is a simulator, and talked about.
+    /// Asks a simulator without telemetry for it, and tells the user.
     fn miss_telemetry(&mut self, now: Instant) -> Result<(), End> {
         let silent = now.duration_since(self.opened);
         if self.client.is_simulator() && silent >= ASK_TIME && now.duration_since(self.last_question) >= ASK_TIME {
@@ -104,12 +104,12 @@ impl Connection<'_> {
         }
         if silent >= MISSING_TIME {
             let text = format_args!("{}: connected for {} s, but no telemetry", self.address, silent.as_secs());
-            self.shared.journal.report(Event::NoTelemetry, text);
+            self.shared.journal.report(Incident::NoTelemetry, text);
         }
         Ok(())
     }
 
-    /// The driven client has been silent for `silent`.
+    /// Cuts the throttle if the driven client has been silent for too long, and asks for telemetry.
     fn watch(&mut self, silent: Duration, now: Instant) -> Result<(), End> {
         if silent < STALE_TIME {
             return Ok(());
@@ -118,21 +118,21 @@ impl Connection<'_> {
             self.cut = true;
             self.last_question = now;
             let text = format_args!("{}: no telemetry for {:.1} s", self.address, silent.as_secs_f64());
-            self.shared.journal.report(Event::Stale, text);
+            self.shared.journal.report(Incident::Stale, text);
             let command = self.helm.cut_throttle();
             return self.steer(command);
         }
-        self.ask_again(silent, now, Event::Stale)
+        self.ask_again(silent, now, Incident::Stale)
     }
 
-    /// Asks a client that has been silent for `silent`, now and then.
-    fn ask_again(&mut self, silent: Duration, now: Instant, event: Event) -> Result<(), End> {
+    /// Asks a client for telemetry, now and then, when it has been silent for `silent`.
+    fn ask_again(&mut self, silent: Duration, now: Instant, incident: Incident) -> Result<(), End> {
         if silent < ASK_TIME || now.duration_since(self.last_question) < ASK_TIME {
             return Ok(());
         }
         self.last_question = now;
         let text = format_args!("{}: no telemetry for {:.0} s", self.address, silent.as_secs_f64());
-        self.shared.journal.report(event, text);
+        self.shared.journal.report(incident, text);
         self.ask()
     }
 }

@@ -1,4 +1,4 @@
-//! Telemetry in, command out.
+//! Answers telemetry with a command.
 
 use std::sync::PoisonError;
 use std::sync::atomic::Ordering;
@@ -7,26 +7,26 @@ use std::time::Instant;
 use data_encoding::BASE64;
 
 use super::{Connection, End};
-use crate::serve::helm::Clock;
-use crate::serve::journal::Event;
-use crate::serve::protocol::{ClientPacket, Command, DecimalMark, NumberStyle, Telemetry};
+use crate::net::connections::Rank;
+use crate::serve::helm::FrameTime;
+use crate::serve::journal::Incident;
 use crate::serve::recording::Queued;
-use crate::serve::registry::Stage;
 use crate::serve::seat::Claim;
+use crate::udacity::{ClientPacket, Command, DecimalMark, NumberStyle, Telemetry};
 
-/// Largest height or width of an image, pixels.
+/// Largest height or width of a picture, pixels.
 const MAX_IMAGE_SIDE: usize = 1920;
-/// Throttle that must move a car.
+/// Smallest throttle that must move a car.
 const STRONG_THROTTLE: f32 = 0.2;
-/// Commands with a strong throttle after which a car must show it.
-const DEAF_AFTER: u32 = 40;
+/// Number of commands with a strong throttle after which a car must follow.
+const MAX_IGNORED: u32 = 40;
 
-impl Connection<'_> {
-    /// Answers the newest telemetry, whose last byte came at `came`.
-    pub(super) fn answer(&mut self, packet: ClientPacket, came: Instant) -> Result<(), End> {
+impl Connection<'_, '_> {
+    /// Answers the newest telemetry, whose last byte arrived at `arrived`.
+    pub(super) fn answer(&mut self, packet: ClientPacket, arrived: Instant) -> Result<(), End> {
         let telemetry = match packet {
             ClientPacket::Telemetry(telemetry, _) => telemetry,
-            _ => return self.let_person_drive(came),
+            _ => return self.let_person_drive(arrived),
         };
         self.learn_style(&telemetry);
         if self.overridden {
@@ -34,38 +34,38 @@ impl Connection<'_> {
             self.shared.journal.step(format_args!("{}: the model drives again", self.address));
         }
         let Some(image) = &telemetry.image else {
-            return self.bad_telemetry(Event::NoImage, format_args!("telemetry without an image"));
+            return self.bad_telemetry(Incident::NoImage, format_args!("telemetry without an image"));
         };
         let Some(speed_mph) = telemetry.speed_mph else {
-            return self.bad_telemetry(Event::NoSpeed, format_args!("telemetry without a speed"));
+            return self.bad_telemetry(Incident::NoSpeed, format_args!("telemetry without a speed"));
         };
         let steering = match self.look(image) {
             Ok(steering) => steering,
-            Err(text) => return self.bad_telemetry(Event::UnreadableImage, format_args!("{text}")),
+            Err(text) => return self.bad_telemetry(Incident::UnreadableImage, format_args!("{text}")),
         };
         match self.shared.seat.claim(self.peer.id, &self.peer.stream, Instant::now()) {
             Claim::Kept => {}
             Claim::Taken => {
-                self.peer.set_stage(Stage::Trusted);
+                self.peer.set_rank(Rank::InUse);
                 self.waits = false;
-                self.shared.journal.report(Event::Drives, format_args!("{} is driven", self.address));
+                self.shared.journal.report(Incident::Drives, format_args!("{} is driven", self.address));
             }
-            // Another was faster; this client's token is kept by asking for its next telemetry.
+            // Another client was faster. The question keeps the token of this one.
             Claim::Refused => return self.ask(),
         }
         self.faults = 0;
         self.lockstep = telemetry.time_s.is_some();
-        let clock = telemetry.time_s.map_or(Clock::Arrival(came), Clock::Simulated);
-        let command = self.helm.command(steering, speed_mph, clock);
+        let time = telemetry.time_s.map_or(FrameTime::Arrival(arrived), FrameTime::Simulated);
+        let command = self.helm.command(steering, speed_mph, time);
         self.steer(command)?;
         self.cut = false;
-        self.shared.statistics().answered(came, Instant::now(), command, speed_mph);
-        self.check_obedience(&telemetry, command);
+        self.shared.statistics().answered(arrived, Instant::now(), command, speed_mph);
+        self.check_throttle(&telemetry, command);
         if let Some(recorder) = &self.shared.recorder {
-            match recorder.push(clock, &self.image, command, speed_mph) {
+            match recorder.push(time, &self.image, command, speed_mph) {
                 Queued::Yes => {}
                 Queued::Dropped => {
-                    self.shared.journal.report(Event::RecordingLags, format_args!("a frame could not be recorded"));
+                    self.shared.journal.report(Incident::RecordingLags, format_args!("a frame could not be recorded"));
                 }
                 Queued::Failed => self.shared.recording_failed.store(true, Ordering::Relaxed),
             }
@@ -73,7 +73,7 @@ impl Connection<'_> {
         Ok(())
     }
 
-    /// What the model says to an image in base64.
+    /// The steering of the model for a picture in base64.
     fn look(&mut self, image: &str) -> Result<f32, String> {
         let len = BASE64.decode_len(image.len()).map_err(|_| "an image whose base64 is incomplete".to_string())?;
         self.image.resize(len, 0);
@@ -94,37 +94,37 @@ impl Connection<'_> {
         }
         self.style = style;
         match style {
-            NumberStyle::Numbers => {
+            NumberStyle::Json => {
                 let text = format_args!("{}: a simulator of the second term (it sends `cte`)", self.address);
-                self.shared.journal.report(Event::SecondTerm, text);
+                self.shared.journal.report(Incident::SecondTerm, text);
             }
             NumberStyle::Strings(mark) if mark != DecimalMark::DOT => {
                 let text = format_args!("{}: writes numbers with the decimal mark `{}`", self.address, mark.char());
-                self.shared.journal.report(Event::DecimalMark, text);
+                self.shared.journal.report(Incident::DecimalMark, text);
             }
             NumberStyle::Strings(_) => {}
         }
     }
 
-    fn let_person_drive(&mut self, came: Instant) -> Result<(), End> {
+    fn let_person_drive(&mut self, arrived: Instant) -> Result<(), End> {
         if !self.overridden {
             self.overridden = true;
-            self.shared.journal.report(Event::Override, format_args!("{}: a person drives", self.address));
+            self.shared.journal.report(Incident::Override, format_args!("{}: a person drives", self.address));
         }
-        self.shared.seat.is_held_by(self.peer.id, came);
+        self.shared.seat.is_held_by(self.peer.id, arrived);
         self.helm.release();
-        (self.deaf, self.cut) = (0, false);
+        (self.ignored, self.cut) = (0, false);
         self.ask()
     }
 
-    /// Telemetry by which nobody can drive.
-    fn bad_telemetry(&mut self, event: Event, text: std::fmt::Arguments) -> Result<(), End> {
-        self.fault(event, text)?;
+    /// Reports telemetry that cannot be used, and answers it.
+    fn bad_telemetry(&mut self, incident: Incident, text: std::fmt::Arguments) -> Result<(), End> {
+        self.fault(incident, text)?;
         self.answer_blind()
     }
 
-    /// Answers telemetry that could not be used: the driving client gets its throttle cut, another is asked again, so that
-    /// the car does not wait for ever.
+    /// Answers telemetry that cannot be used, so that the car does not wait for ever: the driven client gets its throttle cut,
+    /// another one is asked again.
     pub(super) fn answer_blind(&mut self) -> Result<(), End> {
         if self.shared.seat.is_held_by(self.peer.id, Instant::now()) {
             let command = self.helm.cut_throttle();
@@ -134,16 +134,16 @@ impl Connection<'_> {
         }
     }
 
-    /// Says so if the car shows none of the throttle it was given.
-    fn check_obedience(&mut self, telemetry: &Telemetry, command: Command) {
+    /// Tells the user if the car does not follow the throttle.
+    fn check_throttle(&mut self, telemetry: &Telemetry, command: Command) {
         let shows_none = telemetry.throttle.is_some_and(|throttle| throttle == 0.0);
-        let deaf =
+        let ignored =
             shows_none && command.throttle >= STRONG_THROTTLE && telemetry.speed_mph.is_some_and(|mph| mph < 1.0);
-        self.deaf = if deaf { self.deaf + 1 } else { 0 };
-        if self.deaf >= DEAF_AFTER {
-            self.deaf = 0;
-            let text = format_args!("{}: was given throttle {DEAF_AFTER} times and shows none", self.address);
-            self.shared.journal.report(Event::ThrottleIgnored, text);
+        self.ignored = if ignored { self.ignored + 1 } else { 0 };
+        if self.ignored >= MAX_IGNORED {
+            self.ignored = 0;
+            let text = format_args!("{}: was given throttle {MAX_IGNORED} times and shows none", self.address);
+            self.shared.journal.report(Incident::ThrottleIgnored, text);
         }
     }
 }

@@ -1,4 +1,4 @@
-//! One client: its handshake ([`opening`]), its messages, its deadlines ([`deadlines`]) and how it is driven ([`driving`]).
+//! One client: its handshake ([`opening`]), its messages, its deadlines ([`deadlines`]) and its commands ([`driving`]).
 
 mod deadlines;
 mod driving;
@@ -7,42 +7,42 @@ mod opening;
 use std::net::SocketAddr;
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::sync::Arc;
-use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use tungstenite::{Message, Utf8Bytes, WebSocket};
 
 use self::opening::open;
-use super::handshake::Client;
+use super::handshake::ClientInfo;
 use super::helm::Helm;
-use super::journal::Event;
-use super::pace::Pace;
-use super::protocol::{self, ClientPacket, Command, EngineVersion, NumberStyle, ProtocolError};
-use super::registry::{Peer, Stage};
-use super::server::Shared;
-use super::socket::{Socket, is_timeout};
+use super::journal::Incident;
+use super::rate_limit::RateLimit;
+use super::shared::Shared;
 use super::tokens::Tokens;
+use crate::net::connections::{Peer, Rank};
+use crate::net::socket::{Socket, is_timeout};
+use crate::text::excerpt;
+use crate::udacity::{self, ClientPacket, Command, EngineVersion, NumberStyle, ProtocolError};
 
-/// Largest message, bytes.
-const MAX_MESSAGE: usize = 1 << 20;
-/// Messages that are read at once before the newest is answered.
+/// Longest message, bytes.
+const MAX_MESSAGE_LEN: usize = 1 << 20;
+/// Largest number of messages that the server reads at once before it answers the newest.
 const MAX_BATCH: usize = 16;
-/// Time that a client has to read the last words.
-const FAREWELL: Duration = Duration::from_millis(200);
-/// Bad messages in a row after which a client is closed that does not drive.
+/// Longest time that a client has to read the last messages.
+const FAREWELL_TIME: Duration = Duration::from_millis(200);
+/// Number of bad messages in a row after which the server closes a client that is not driven.
 const MAX_FAULTS: u32 = 10;
-/// Beat of a connection that waits for telemetry.
-const QUICK_BEAT: Duration = Duration::from_millis(10);
-/// Beat of one that has time.
-const SLOW_BEAT: Duration = Duration::from_millis(200);
+/// Tick of a connection that waits for telemetry.
+const QUICK_TICK: Duration = Duration::from_millis(10);
+/// Tick of the other connections.
+const SLOW_TICK: Duration = Duration::from_millis(200);
 
 /// Why a connection ends.
 #[derive(Debug)]
 enum End {
     /// The client left, or this program ends.
     Closed,
-    /// Something is wrong with it.
-    Fault(Event, String),
+    /// The client does something wrong.
+    Fault(Incident, String),
     /// The stream failed.
     Broken(std::io::Error),
 }
@@ -60,7 +60,7 @@ impl From<tungstenite::Error> for End {
             tungstenite::Error::ConnectionClosed | tungstenite::Error::AlreadyClosed => End::Closed,
             tungstenite::Error::Protocol(ResetWithoutClosingHandshake | SendAfterClosing) => End::Closed,
             tungstenite::Error::Io(error) => End::Broken(error),
-            other => End::Fault(Event::BrokenFrames, other.to_string()),
+            other => End::Fault(Incident::BrokenFrames, other.to_string()),
         }
     }
 }
@@ -68,85 +68,85 @@ impl From<tungstenite::Error> for End {
 /// Serves one client until it leaves.
 pub(super) fn serve(shared: &Shared, peer: &Arc<Peer>, address: SocketAddr) {
     let result = open(shared, peer, address).and_then(|mut connection| {
-        // The driven car gets its last words even if this program fails.
+        // The driven car gets its last command even if this program is at fault.
         let result = catch_unwind(AssertUnwindSafe(|| connection.run()));
-        connection.part();
+        connection.close();
         result.unwrap_or_else(|panic| resume_unwind(panic))
     });
     let journal = &shared.journal;
     match result {
-        Ok(()) | Err(End::Closed) if peer.stage() == Stage::Opening => {
+        Ok(()) | Err(End::Closed) if peer.rank() == Rank::Unknown => {
             journal.step(format_args!("{address}: left before it had sent a request"));
         }
-        Ok(()) | Err(End::Closed) => journal.report(Event::Disconnected, format_args!("{address} left")),
-        Err(End::Fault(event, text)) => journal.report(event, format_args!("{address}: {text}")),
-        Err(End::Broken(error)) => journal.report(Event::Disconnected, format_args!("{address} left: {error}")),
+        Ok(()) | Err(End::Closed) => journal.report(Incident::Disconnected, format_args!("{address} left")),
+        Err(End::Fault(incident, text)) => journal.report(incident, format_args!("{address}: {text}")),
+        Err(End::Broken(error)) => journal.report(Incident::Disconnected, format_args!("{address} left: {error}")),
     }
 }
 
-/// A WebSocket and what is known of the client behind it.
-struct Connection<'a> {
-    shared: &'a Shared<'a>,
+/// A WebSocket and what the server knows of the client behind it.
+struct Connection<'a, 'o> {
+    shared: &'a Shared<'o>,
     peer: &'a Arc<Peer>,
     address: SocketAddr,
     websocket: WebSocket<Socket>,
-    client: Client,
-    /// Whether it got the handshake of Socket.IO; the simulator does without.
+    client: ClientInfo,
+    /// Whether it got the handshake of Socket.IO. The simulator needs none.
     greeted: bool,
     opened: Instant,
     last_message: Instant,
     last_ping: Instant,
-    /// When the last event came that counts as telemetry.
+    /// Time of the last event that counts as telemetry.
     last_telemetry: Option<Instant>,
-    /// When telemetry was last asked for, without telemetry to answer.
+    /// Time of the last `manual` event that asked for telemetry after a silence.
     last_question: Instant,
     tokens: Tokens,
-    /// Telemetry that is not answered yet, and when its last byte came.
+    /// Telemetry without an answer yet, and the arrival of its last byte.
     held: Option<(Utf8Bytes, Instant)>,
     /// Bad messages in a row.
     faults: u32,
     style: NumberStyle,
     helm: Helm,
-    /// How much of a stranger's messages is read.
-    pace: Pace,
-    /// Was told that another drives.
+    /// Limits what the server reads of a client that is not driven.
+    rate_limit: RateLimit,
+    /// Whether it waits because another client is driven.
     waits: bool,
-    /// The client waits for each answer: its clock counts, and the server's has no meaning for it.
+    /// Whether the client waits for each answer, so that its simulated time counts.
     lockstep: bool,
-    /// A person drives.
+    /// Whether a person drives by hand.
     overridden: bool,
-    /// The throttle was cut.
+    /// Whether the throttle was cut because telemetry is stale.
     cut: bool,
-    /// Commands in a row with a strong throttle that the car does not show.
-    deaf: u32,
-    /// Messages shown by `--check`.
+    /// Number of commands in a row with a strong throttle that the car does not follow.
+    ignored: u32,
+    /// Number of messages that `--check` has shown.
     shown: u32,
     image: Vec<u8>,
     reply: String,
 }
 
-impl Connection<'_> {
+impl Connection<'_, '_> {
     fn run(&mut self) -> Result<(), End> {
         let mut batch = Vec::with_capacity(MAX_BATCH);
         loop {
-            if self.shared.stop.load(Ordering::Relaxed) {
+            if self.shared.stop.requested() {
                 return Ok(());
             }
-            self.websocket.get_mut().begin_beat();
+            self.websocket.get_mut().begin_tick();
             let mut messages = 1;
             if let Some(message) = self.read()? {
                 let (mut bytes, mut end) = (message.0.len(), Ok(()));
                 batch.push(message);
-                // Whatever else is complete already: of several telemetries only the newest is answered.
+                // Reads all complete messages: of several telemetries the server answers only the newest.
                 self.websocket.get_mut().set_waiting(false)?;
-                while batch.len() < MAX_BATCH && bytes < MAX_MESSAGE {
+                while batch.len() < MAX_BATCH && bytes < MAX_MESSAGE_LEN {
                     match self.read() {
                         Ok(Some(message)) => {
                             bytes += message.0.len();
                             batch.push(message);
                         }
                         Ok(None) => break,
-                        // What came before it is still served.
+                        // The messages before it are still served.
                         Err(error) => {
                             end = Err(error);
                             break;
@@ -155,24 +155,24 @@ impl Connection<'_> {
                 }
                 self.websocket.get_mut().set_waiting(true)?;
                 messages = batch.len();
-                self.take(&mut batch)?;
+                self.handle(&mut batch)?;
                 end?;
             }
-            self.after_beat()?;
+            self.after_tick()?;
             let bytes = self.websocket.get_mut().take_count();
-            if bytes > 0 && self.peer.stage() != Stage::Trusted {
+            if bytes > 0 && self.peer.rank() != Rank::InUse {
                 self.rest(messages, bytes);
             }
         }
     }
 
-    /// Lets a stranger wait who has sent so much.
+    /// Pauses the reading from a client that has used up its credit.
     fn rest(&mut self, messages: usize, bytes: usize) {
-        /// Time in which it is noticed that the connection has to end.
+        /// Longest time until the pause notices that the connection has to end.
         const STEP: Duration = Duration::from_millis(5);
         let now = Instant::now();
-        let until = now + self.pace.charge(messages, bytes, now);
-        while !self.shared.stop.load(Ordering::Relaxed) && !self.peer.is_closing() {
+        let until = now + self.rate_limit.charge(messages, bytes, now);
+        while !self.shared.stop.requested() && !self.peer.must_close() {
             let left = until.saturating_duration_since(Instant::now());
             if left.is_zero() {
                 return;
@@ -181,7 +181,7 @@ impl Connection<'_> {
         }
     }
 
-    /// The next complete text message; `None` if none has come within the beat.
+    /// The next complete text message; `None` if none has arrived within the tick.
     fn read(&mut self) -> Result<Option<(Utf8Bytes, Instant)>, End> {
         match self.websocket.read() {
             Ok(Message::Text(text)) => {
@@ -189,18 +189,20 @@ impl Connection<'_> {
                 Ok(Some((text, self.websocket.get_ref().last_byte())))
             }
             Ok(Message::Close(_)) => Err(End::Closed),
-            Ok(Message::Binary(_)) => self.fault(Event::NotSocketIo, format_args!("a binary message")).map(|()| None),
-            // Answered by the next read. Returning lets deadlines be looked after, however many come.
+            Ok(Message::Binary(_)) => {
+                self.fault(Incident::NotSocketIo, format_args!("a binary message")).map(|()| None)
+            }
+            // The next read answers a ping. The return lets the caller check the deadlines, however many pings arrive.
             Ok(_) => Ok(None),
             Err(tungstenite::Error::Io(error)) if is_timeout(&error) => Ok(None),
             Err(error) => Err(error.into()),
         }
     }
 
-    /// Serves messages in their order, but of all telemetry only the newest.
-    fn take(&mut self, batch: &mut Vec<(Utf8Bytes, Instant)>) -> Result<(), End> {
+    /// Handles messages in their order, and answers only the newest telemetry.
+    fn handle(&mut self, batch: &mut Vec<(Utf8Bytes, Instant)>) -> Result<(), End> {
         let newest = {
-            let mut packets: Vec<_> = batch.iter().map(|(text, _)| protocol::parse(text)).collect();
+            let mut packets: Vec<_> = batch.iter().map(|(text, _)| udacity::parse(text)).collect();
             let is_state = |packet: &Result<ClientPacket, ProtocolError>| {
                 matches!(packet, Ok(ClientPacket::Telemetry(..) | ClientPacket::Manual(_)))
             };
@@ -239,7 +241,7 @@ impl Connection<'_> {
         Ok(())
     }
 
-    /// Whether the newest telemetry can be answered now: no better is on its way, and no other client drives.
+    /// Whether the newest telemetry can be answered now: no other is expected, and no other client is driven.
     fn may_answer(&mut self) -> bool {
         let now = Instant::now();
         if !self.tokens.should_answer(now) {
@@ -248,14 +250,14 @@ impl Connection<'_> {
         let open = self.shared.seat.is_open_to(self.peer.id, now);
         if !open && !std::mem::replace(&mut self.waits, true) {
             self.shared.journal.report(
-                Event::SeatTaken,
+                Incident::SeatTaken,
                 format_args!("{} has sent telemetry, but another client drives", self.address),
             );
         }
         open
     }
 
-    /// Everything but telemetry.
+    /// Handles everything but telemetry.
     fn other(&mut self, packet: &Result<ClientPacket, ProtocolError>) -> Result<(), End> {
         match packet {
             Ok(ClientPacket::Close) => Err(End::Closed),
@@ -266,35 +268,36 @@ impl Connection<'_> {
             Ok(ClientPacket::Connect { namespace }) => {
                 let version = self.client.version;
                 if *namespace != "/" {
-                    let text = format_args!("{}: wants the namespace {:?}", self.address, start(namespace));
-                    self.shared.journal.report(Event::Namespace, text);
-                    return self.send(|out| protocol::print_namespace_refused(out, version, namespace));
+                    let text = format_args!("{}: wants the namespace \"{}\"", self.address, excerpt(namespace, SHOWN));
+                    self.shared.journal.report(Incident::Namespace, text);
+                    return self.send(|out| udacity::print_namespace_refused(out, version, namespace));
                 }
-                // The simulator never asks; Socket.IO 2 was connected without being asked.
+                // The simulator never asks; a client of Socket.IO 2 is connected without asking.
                 if self.greeted && version == EngineVersion::V4 {
                     let sid = session_id(self.peer.id);
-                    self.send(|out| protocol::print_connected(out, version, &sid))?;
+                    self.send(|out| udacity::print_connected(out, version, &sid))?;
                 }
                 Ok(())
             }
             Ok(ClientPacket::OtherEvent { name, ack }) => {
-                let text = format_args!("{}: the event {:?} is not known and ignored", self.address, start(name));
+                let text =
+                    format_args!("{}: the event \"{}\" is not known and ignored", self.address, excerpt(name, SHOWN));
                 self.shared.journal.step(text);
                 match ack {
-                    Some(ack) => self.send(|out| protocol::print_ack(out, *ack)),
+                    Some(ack) => self.send(|out| udacity::print_ack(out, *ack)),
                     None => Ok(()),
                 }
             }
             Ok(_) => Ok(()),
             Err(error) => {
-                let event = match error {
-                    ProtocolError::NotEngineIo(_) => Event::NotSocketIo,
-                    ProtocolError::PlainJson(_) => Event::PlainJson,
-                    ProtocolError::Event(_) => Event::BrokenEvent,
+                let incident = match error {
+                    ProtocolError::NotEngineIo(_) => Incident::NotSocketIo,
+                    ProtocolError::PlainJson(_) => Incident::PlainJson,
+                    ProtocolError::Event(_) => Incident::BrokenEvent,
                 };
-                self.fault(event, format_args!("{error}"))?;
-                // It may have been telemetry, and the client waits.
-                if event == Event::BrokenEvent { self.answer_blind() } else { Ok(()) }
+                self.fault(incident, format_args!("{error}"))?;
+                // It may have been telemetry for which the client waits for an answer.
+                if incident == Incident::BrokenEvent { self.answer_blind() } else { Ok(()) }
             }
         }
     }
@@ -302,24 +305,24 @@ impl Connection<'_> {
     fn acknowledge(&mut self, packet: &Result<ClientPacket, ProtocolError>) -> Result<(), End> {
         match packet {
             Ok(ClientPacket::Telemetry(_, Some(ack)) | ClientPacket::Manual(Some(ack))) => {
-                self.send(|out| protocol::print_ack(out, *ack))
+                self.send(|out| udacity::print_ack(out, *ack))
             }
             _ => Ok(()),
         }
     }
 
     /// Counts and reports a bad message.
-    fn fault(&mut self, event: Event, text: std::fmt::Arguments) -> Result<(), End> {
+    fn fault(&mut self, incident: Incident, text: std::fmt::Arguments) -> Result<(), End> {
         self.faults += 1;
-        if self.faults >= MAX_FAULTS && self.peer.stage() != Stage::Trusted {
-            return Err(End::Fault(event, format!("{MAX_FAULTS} bad messages in a row, the last {text}; closed")));
+        if self.faults >= MAX_FAULTS && self.peer.rank() != Rank::InUse {
+            return Err(End::Fault(incident, format!("{MAX_FAULTS} bad messages in a row, the last {text}; closed")));
         }
-        self.shared.journal.report(event, format_args!("{}: {text}", self.address));
+        self.shared.journal.report(incident, format_args!("{}: {text}", self.address));
         Ok(())
     }
 
-    /// The last words to a driven car: nobody is at the wheel from now on.
-    fn part(&mut self) {
+    /// Cuts the throttle of a driven car, because nobody drives it from now on, and closes the connection.
+    fn close(&mut self) {
         let now = Instant::now();
         if self.shared.seat.is_held_by(self.peer.id, now) && !self.overridden {
             let command = self.helm.cut_throttle();
@@ -327,18 +330,18 @@ impl Connection<'_> {
             let _ = self.steer(command);
         }
         let _ = self.websocket.close(None);
-        self.websocket.get_mut().finish(FAREWELL);
+        self.websocket.get_mut().finish(FAREWELL_TIME);
     }
 
     fn steer(&mut self, command: Command) -> Result<(), End> {
         self.tokens.sent();
         let style = self.style;
-        self.send(|out| protocol::print_steer(out, command, style))
+        self.send(|out| udacity::print_steer(out, command, style))
     }
 
     fn ask(&mut self) -> Result<(), End> {
         self.tokens.sent();
-        self.send(protocol::print_manual)
+        self.send(udacity::print_manual)
     }
 
     fn send(&mut self, print: impl FnOnce(&mut String)) -> Result<(), End> {
@@ -353,22 +356,19 @@ impl Connection<'_> {
         sent.map_err(End::from)
     }
 
-    /// Shows the first messages to those who check, and then some.
+    /// With `--check`, shows the first messages in full number and then one of many.
     fn show(&mut self, direction: char, text: &str) {
-        /// Messages that are all shown.
+        /// Number of messages that are all shown.
         const ALL: u32 = 20;
-        /// After those, one of so many.
+        /// After those, one message of this many is shown.
         const EVERY: u32 = 200;
         if !self.shared.journal.checks() {
             return;
         }
         self.shown += 1;
         if self.shown <= ALL || self.shown.is_multiple_of(EVERY) {
-            let shown = start(text);
-            let rest = text.len() - shown.len();
-            // What a terminal would obey is not for it.
-            let shown: String = shown.chars().map(|c| if c.is_control() { '\u{fffd}' } else { c }).collect();
-            let more = if rest > 0 { format!("… ({rest} bytes more)") } else { String::new() };
+            let more = if text.len() > SHOWN { format!(" ({} bytes)", text.len()) } else { String::new() };
+            let shown = excerpt(text, SHOWN);
             self.shared.journal.step(format_args!("{} {direction} {shown}{more}", self.address));
         }
         if self.shown == ALL {
@@ -377,16 +377,10 @@ impl Connection<'_> {
     }
 }
 
-/// Name of a session. Nothing can be done with the name of another's.
+/// Name of the session of connection `id`. The name of another session gives no access to it.
 fn session_id(id: u64) -> String {
     format!("{id:020x}")
 }
 
-/// The start of a text.
-fn start(text: &str) -> &str {
-    let mut end = text.len().min(120);
-    while !text.is_char_boundary(end) {
-        end -= 1;
-    }
-    &text[..end]
-}
+/// Characters of a message that are shown to a person.
+const SHOWN: usize = 120;

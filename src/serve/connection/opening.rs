@@ -1,59 +1,63 @@
-//! The handshake of a connection: its request is read and answered.
+//! The handshake of a connection: reads its request and answers it.
 
 use std::io::{Read, Write};
 use std::net::SocketAddr;
 use std::sync::Arc;
-use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use tungstenite::WebSocket;
 use tungstenite::protocol::{Role, WebSocketConfig};
 
-use super::{Connection, End, FAREWELL, MAX_MESSAGE, QUICK_BEAT, SLOW_BEAT};
+use super::{Connection, End, FAREWELL_TIME, MAX_MESSAGE_LEN, QUICK_TICK, SLOW_TICK};
+use crate::net::connections::{Peer, Rank};
+use crate::net::socket::{Socket, is_timeout};
 use crate::serve::handshake::{Verdict, examine};
 use crate::serve::helm::Helm;
-use crate::serve::journal::Event;
-use crate::serve::pace::Pace;
-use crate::serve::protocol::NumberStyle;
-use crate::serve::registry::{Peer, Stage};
-use crate::serve::server::Shared;
-use crate::serve::socket::{Socket, is_timeout};
+use crate::serve::journal::Incident;
+use crate::serve::rate_limit::RateLimit;
+use crate::serve::shared::Shared;
 use crate::serve::tokens::Tokens;
+use crate::text::excerpt;
+use crate::udacity::NumberStyle;
 
-/// Time for the whole request of a handshake.
-const HANDSHAKE_TIME: Duration = Duration::from_secs(5);
+/// Longest time for the request of a handshake.
+const HANDSHAKE_LIMIT: Duration = Duration::from_secs(5);
 
 /// Reads the request and answers it.
-pub(super) fn open<'a>(shared: &'a Shared, peer: &'a Arc<Peer>, address: SocketAddr) -> Result<Connection<'a>, End> {
+pub(super) fn open<'a, 'o>(
+    shared: &'a Shared<'o>,
+    peer: &'a Arc<Peer>,
+    address: SocketAddr,
+) -> Result<Connection<'a, 'o>, End> {
     let journal = &shared.journal;
     journal.step(format_args!("{address}: TCP connection"));
-    let mut socket = Socket::new(peer.stream.try_clone()?, SLOW_BEAT)?;
+    let mut socket = Socket::new(peer.stream.try_clone()?, SLOW_TICK)?;
     let began = Instant::now();
     let mut head = Vec::with_capacity(1024);
     let (response, head_len, client) = loop {
         let mut chunk = [0; 1024];
-        socket.begin_beat();
+        socket.begin_tick();
         match socket.read(&mut chunk) {
             Ok(0) => return Err(End::Closed),
             Ok(len) => head.extend_from_slice(&chunk[..len]),
             Err(error) if is_timeout(&error) => {}
             Err(error) => return Err(error.into()),
         }
-        if shared.stop.load(Ordering::Relaxed) {
+        if shared.stop.requested() {
             return Err(End::Closed);
         }
         match examine(&head, &shared.options.allowed_origins) {
-            Verdict::Incomplete if began.elapsed() > HANDSHAKE_TIME => {
-                let text = format!("no complete request within {} s", HANDSHAKE_TIME.as_secs());
-                return Err(End::Fault(Event::TooSlow, text));
+            Verdict::Incomplete if began.elapsed() > HANDSHAKE_LIMIT => {
+                let text = format!("no complete request within {} s", HANDSHAKE_LIMIT.as_secs());
+                return Err(End::Fault(Incident::TooSlow, text));
             }
             Verdict::Incomplete => {}
             Verdict::Refuse { response, reason } => {
                 show_request(shared, address, &head);
                 journal.step(format_args!("{address} < {}", response.lines().next().unwrap_or("")));
                 socket.write_all(response.as_bytes())?;
-                socket.finish(FAREWELL);
-                return Err(End::Fault(Event::Refused, format!("refused, {reason}")));
+                socket.finish(FAREWELL_TIME);
+                return Err(End::Fault(Incident::Refused, format!("refused, {reason}")));
             }
             Verdict::Accept { response, head_len, client } => break (response, head_len, client),
         }
@@ -61,23 +65,23 @@ pub(super) fn open<'a>(shared: &'a Shared, peer: &'a Arc<Peer>, address: SocketA
     show_request(shared, address, &head[..head_len]);
     journal.step(format_args!("{address} < {}", response.lines().next().unwrap_or("")));
     socket.write_all(response.as_bytes())?;
-    peer.set_stage(Stage::Open);
+    peer.set_rank(Rank::WebSocket);
     let who = match &client {
         client if client.is_simulator() => "Udacity's simulator",
         client if client.agent.is_empty() => "a client without a name",
         client => &client.agent,
     };
-    journal.report(Event::Connected, format_args!("{address}: {who} connected"));
+    journal.report(Incident::Connected, format_args!("{address}: {who} connected"));
     if client.is_simulator() {
         journal.step(format_args!("{address}: needs no Socket.IO handshake; its first telemetry comes by itself"));
     }
-    socket.set_beat(QUICK_BEAT)?;
+    socket.set_tick(QUICK_TICK)?;
     let config = WebSocketConfig::default()
         .read_buffer_size(32 * 1024)
         .write_buffer_size(0)
         .max_write_buffer_size(64 * 1024)
-        .max_message_size(Some(MAX_MESSAGE))
-        .max_frame_size(Some(MAX_MESSAGE));
+        .max_message_size(Some(MAX_MESSAGE_LEN))
+        .max_frame_size(Some(MAX_MESSAGE_LEN));
     let rest = head[head_len..].to_vec();
     let websocket = WebSocket::from_partially_read(socket, rest, Role::Server, Some(config));
     let now = Instant::now();
@@ -99,11 +103,11 @@ pub(super) fn open<'a>(shared: &'a Shared, peer: &'a Arc<Peer>, address: SocketA
         style: NumberStyle::default(),
         helm: Helm::new(shared.options.helm),
         waits: false,
-        pace: Pace::new(now),
+        rate_limit: RateLimit::new(now),
         lockstep: false,
         overridden: false,
         cut: false,
-        deaf: 0,
+        ignored: 0,
         shown: 0,
         image: Vec::new(),
         reply: String::new(),
@@ -113,7 +117,7 @@ pub(super) fn open<'a>(shared: &'a Shared, peer: &'a Arc<Peer>, address: SocketA
 fn show_request(shared: &Shared, address: SocketAddr, head: &[u8]) {
     if shared.journal.checks() {
         for line in String::from_utf8_lossy(head).lines().filter(|line| !line.is_empty()).take(20) {
-            let line: String = line.chars().filter(|c| !c.is_control()).take(160).collect();
+            let line = excerpt(line, 160);
             shared.journal.step(format_args!("{address} > {line}"));
         }
     }

@@ -4,31 +4,16 @@ use std::fs::{self, File};
 use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 
+use crate::dataset::udacity_writer::{HEADER, picture_name, write_row};
 use crate::simulator::camera::jpeg;
-use crate::simulator::camera::pinhole::{BodyPose, Camera, Mount, RgbFrame};
+use crate::simulator::camera::pinhole::{Camera, Mount, RgbFrame};
 use crate::simulator::camera::renderer::Renderer;
-use crate::simulator::recorder::record::LogFormat;
-use crate::simulator::road::track::Track;
+use crate::simulator::recorder::options::LogFormat;
+use crate::simulator::recorder::sample::Sample;
 use crate::simulator::scenery::light::Variant;
 use crate::simulator::scenery::world::World;
+use crate::simulator::track::Track;
 use crate::{Error, Result};
-
-/// One row of the log before its pictures are taken.
-#[derive(Clone, Debug)]
-pub struct Sample {
-    /// Simulated time, s.
-    pub time_s: f64,
-    /// The car.
-    pub body: BodyPose,
-    /// Label: steering, [-1, 1], + = right.
-    pub steering: f64,
-    /// Throttle, 0 to 1.
-    pub throttle: f64,
-    /// Brake, 0 to 1.
-    pub brake: f64,
-    /// Speed, mph.
-    pub speed_mph: f64,
-}
 
 /// Takes the pictures of rows. Keeps its buffers.
 #[derive(Default)]
@@ -52,12 +37,12 @@ impl Photographer {
     }
 }
 
-/// Name of a picture taken `time_s` after noon of 1 January 2026, the simulator's fixed date.
+/// Noon of 1 January 2026, UTC, where simulated time begins in names of pictures: ms since 1970.
+const BEGIN_MS: u64 = 1_767_268_800_000;
+
+/// Name of the picture of `mount` at the simulated time `time_s`.
 fn image_name(mount: Mount, time_s: f64) -> String {
-    let ms = (time_s * 1000.0).round() as u64 + 12 * 3_600_000;
-    let (day, ms) = (1 + ms / 86_400_000, ms % 86_400_000);
-    let (hour, minute, second) = (ms / 3_600_000, ms / 60_000 % 60, ms / 1000 % 60);
-    format!("{}_2026_01_{day:02}_{hour:02}_{minute:02}_{second:02}_{:03}.jpg", mount.name(), ms % 1000)
+    picture_name(mount.name(), BEGIN_MS + (time_s * 1000.0).round() as u64)
 }
 
 /// The lines of a log, in its format.
@@ -80,7 +65,7 @@ impl LogLines {
     /// What stands above the rows.
     pub fn header(&self) -> &'static str {
         match self.format {
-            LogFormat::Sample => "center,left,right,steering,throttle,brake,speed\n",
+            LogFormat::Sample => HEADER,
             LogFormat::V2 => "",
         }
     }
@@ -88,16 +73,13 @@ impl LogLines {
     /// Appends the line of `sample`.
     pub fn row(&self, sample: &Sample, text: &mut Vec<u8>) -> io::Result<()> {
         let separator = if self.format == LogFormat::Sample { ", " } else { "," };
-        for mount in Mount::ALL {
-            let name = image_name(mount, sample.time_s);
-            match self.format {
-                LogFormat::Sample => write!(text, "IMG/{name}{separator}")?,
-                LogFormat::V2 => write!(text, "{}{separator}", self.images.join(name).display())?,
-            }
-        }
-        let numbers =
-            [sample.steering, sample.throttle, sample.brake, sample.speed_mph].map(|v| (v as f32).to_string());
-        writeln!(text, "{}", numbers.join(separator))
+        let names = Mount::ALL.map(|mount| image_name(mount, sample.time_s));
+        let [center, left, right] = names.map(|name| match self.format {
+            LogFormat::Sample => format!("IMG/{name}"),
+            LogFormat::V2 => self.images.join(name).display().to_string(),
+        });
+        let numbers = [sample.steering, sample.throttle, sample.brake, sample.speed_mph].map(|v| v as f32);
+        write_row(text, separator, [&center, &left, &right], numbers)
     }
 }
 

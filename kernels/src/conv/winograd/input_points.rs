@@ -1,28 +1,31 @@
-//! The points of the input and the taps on them, which the forward pass and the weight gradient share.
+//! The points of the input and the taps on them. The forward pass and the weight gradient share them.
 
 use std::ops::Range;
 
-use super::rows_per_tile;
+use super::choice::rows_per_tile;
 use super::strips::{Maps, Strip, Strips};
-use crate::conv::ConvShape;
-use crate::conv::prepare::Layout;
-use crate::simd::Simd;
+use super::tiles;
+use crate::Isa;
+use crate::conv::layout::{self, Layout};
+use crate::conv_shape::ConvShape;
 
-/// Taps of one row on the planes of a point, and the filters they stand for.
+/// Taps of one row on the planes of a point. Each tap stands for a filter of up to 3 rows.
 #[derive(Clone, Debug)]
 pub(super) struct Taps {
-    /// Where each lies in the planes of a point.
+    /// Offset of each tap in the planes of a point.
     pub offsets: Vec<usize>,
-    /// Where its weight is for output channel 0, and how far apart channels are.
+    /// Offset of the first weight of its filter, for output channel 0.
     pub weights: Vec<usize>,
+    /// Distance between the weights of two output channels.
     pub weight_stride: usize,
-    pub phases: Vec<Phase>,
+    /// The filters, grouped by their rows.
+    pub phases: Vec<Filters>,
     /// The largest offset.
     pub farthest: usize,
 }
 
 impl Taps {
-    pub fn new(offsets: Vec<usize>, weights: Vec<usize>, weight_stride: usize, phases: Vec<Phase>) -> Taps {
+    pub fn new(offsets: Vec<usize>, weights: Vec<usize>, weight_stride: usize, phases: Vec<Filters>) -> Taps {
         let farthest = offsets.iter().max().copied().unwrap_or(0);
         Taps { offsets, weights, weight_stride, phases, farthest }
     }
@@ -32,30 +35,30 @@ impl Taps {
     }
 }
 
-/// Taps whose filters have the same rows.
+/// Taps whose filters have the same rows: those of one phase.
 #[derive(Clone, Debug)]
-pub(super) struct Phase {
-    /// Which taps.
+pub(super) struct Filters {
+    /// The taps, as a range.
     pub taps: Range<usize>,
-    /// How far from the weight of a tap those of its filter's rows are; rows it has not are 0.
+    /// Distance from the weight of a tap to each row of its filter; a missing row is 0.
     pub rows: [Option<usize>; 3],
-    /// The points they have a use for: a filter of 2 rows can do without one.
+    /// The points they need: a filter of 2 rows leaves one out.
     pub points: Range<usize>,
 }
 
-/// How images become points.
+/// The transform of images to points.
 #[derive(Clone, Debug)]
 pub(super) struct InputPoints {
     pub shape: ConvShape,
     pub strips: Strips,
     layout: Layout,
-    /// Whether the stride makes four maps of each, all of which are used, and nothing is padded: no copy is needed then.
+    /// Whether strides of 2 make four maps of each map, all of them are used, and nothing is padded. Then no copy is needed.
     pairs: bool,
 }
 
 impl InputPoints {
-    /// The points of `shape` and the taps on them, if it gains. `most` tells from the rows of a tile, the planes of a point and the
-    /// positions of a tile how many tiles go into a strip.
+    /// The points of `shape` and the taps on them, or `None` where the direct algorithm is as fast. `most` gives the number of
+    /// tiles of a strip from the rows of a tile, the planes of a point and the positions of a tile.
     pub fn new(shape: ConvShape, most: impl FnOnce(usize, usize, usize) -> usize) -> Option<(InputPoints, Taps)> {
         let ConvShape { c, kh, kw, stride_h, stride_w, .. } = shape;
         let (row_phases, column_phases) = (stride_h.min(kh), stride_w.min(kw));
@@ -79,62 +82,59 @@ impl InputPoints {
                 }
             }
             let rows = rows_of(phase);
-            phases.push(Phase {
+            phases.push(Filters {
                 taps: first..offsets.len(),
                 rows: std::array::from_fn(|j| (j < rows).then_some(j * stride_h * kw)),
                 points: 0..strips.points() - usize::from(rows < 3),
             });
         }
         let taps = Taps::new(offsets, weights, shape.taps(), phases);
-        let padded = shape.pad_top + shape.pad_bottom + shape.pad_left + shape.pad_right > 0;
-        let pairs = !padded && [stride_h, stride_w, row_phases, column_phases] == [2; 4];
+        let pairs = !shape.is_padded() && [stride_h, stride_w, row_phases, column_phases] == [2; 4];
         Some((InputPoints { shape, strips, layout, pairs }, taps))
     }
 
-    /// Maps of an image in the layout, which are the planes of a point.
+    /// Number of maps of an image in the layout, which are the planes of a point.
     pub fn planes(&self) -> usize {
         self.layout.image() / (self.layout.rows * self.layout.pitch)
     }
 
-    /// Elements of the planes of a point.
+    /// Length of the planes of a point.
     pub fn stride(&self) -> usize {
         self.planes() * self.strips.plane
     }
 
-    /// Elements of all points of a strip.
+    /// Length of all points of a strip.
     pub fn len(&self) -> usize {
         self.strips.points() * self.stride()
     }
 
-    /// Whether images are brought into the layout first.
+    /// Whether images are copied into the layout first.
     fn copies(&self) -> bool {
         self.layout.copies && !self.pairs
     }
 
-    /// Elements of the images that are brought into the layout.
+    /// Length of the copies of a group of images.
     pub fn copy_len(&self) -> usize {
         if self.copies() { self.strips.images * self.layout.image() } else { 0 }
     }
 
-    /// Brings a group of images into the layout.
-    #[inline(always)]
-    pub fn lay_out<'a, S: Simd>(&self, simd: S, x: &'a [f32], copy: &'a mut [f32]) -> &'a [f32] {
+    /// A group of images in the layout, copied to `copy` where necessary.
+    pub fn lay_out<'a>(&self, isa: Isa, x: &'a [f32], copy: &'a mut [f32]) -> &'a [f32] {
         if !self.copies() {
             return x;
         }
         let copy = &mut copy[..x.len() / self.shape.x_len() * self.layout.image()];
-        self.layout.copy(simd, x, copy);
+        layout::copy(isa, &self.layout, x, copy);
         copy
     }
 
-    /// The points of a strip of images in the layout.
-    #[inline(always)]
-    pub fn of_strip<S: Simd, const M: usize>(&self, simd: S, strip: Strip, from: &[f32], points: &mut [f32]) {
+    /// Writes the points of a strip of images in the layout.
+    pub fn of_strip(&self, isa: Isa, strip: Strip, from: &[f32], points: &mut [f32]) {
         if self.pairs {
             let ConvShape { c, h, w, .. } = self.shape;
-            return self.strips.input_of_pairs::<S, M>(simd, strip, [h, w], c, from, points);
+            return tiles::input_of_pairs(isa, &self.strips, strip, [h, w], c, from, points);
         }
         let maps = Maps { height: self.layout.rows, width: self.layout.pitch, above: 0, left: 0 };
-        self.strips.input::<S, M>(simd, strip, maps, self.planes(), from, points);
+        tiles::input(isa, &self.strips, strip, maps, self.planes(), from, points);
     }
 }

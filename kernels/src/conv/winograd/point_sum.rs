@@ -1,29 +1,33 @@
 //! From the points of the input to the rows of the output.
 //!
-//! For each position and output channel, the value of the output at each point is a sum over the taps of one row. A tile is
-//! 8 channels by 3 vectors of positions, or as in `direct` less; it goes through the points one after the other, with the
-//! kernel of `direct`, and its values at all points wait in the first-level cache to be made into rows of the output. Each value
+//! For each position and output channel, the value of the output at a point is a sum over the taps of one row. A tile is 8 channels
+//! by 3 vectors of positions, or less, as in `tap_sum`. It goes through the points one after the other, with the kernel of
+//! `tap_sum`. Its values at all points stay in the first-level cache until they are transformed to rows of the output. Each value
 //! is one chain of multiply-adds in the order of the taps, whatever the tile it falls in.
 
 use std::ops::Range;
 
 use super::input_points::Taps;
 use super::strips::{Strip, Strips};
-use super::transform::{self, MOST_POINTS, POINT_ONE};
-use crate::conv::direct::{MOST_CHANNELS, tile, tile_height};
-use crate::simd::{MOST_LANES, Purpose, Simd, prefetch_part};
+use super::transform::{self, MAX_POINTS, POINT_ONE};
+use crate::Isa;
+use crate::conv::tap_sum::{MAX_CHANNELS, tile, tile_height};
+use crate::simd::{MAX_LANES, Purpose, Simd, prefetch_part};
 
-/// Where the positions of the tiles lie in the output.
+/// The place of the positions of the tiles in the output.
 #[derive(Clone, Debug)]
 pub(super) struct Target {
-    /// The rows and columns that the output has, counted from the first tile and position.
+    /// The rows that the output has, counted from the first tile.
     pub rows: Range<usize>,
+    /// The columns that the output has, counted from the first position.
     pub columns: Range<usize>,
-    /// Where the first row and column of these lies in a map of the output, and how far apart rows and columns are there.
+    /// Offset of the first of these rows and columns in a map of the output.
     pub first: usize,
+    /// Distance between two rows in a map of the output.
     pub row_step: usize,
+    /// Distance between two columns in a map of the output.
     pub column_step: usize,
-    /// Elements of a map.
+    /// Length of a map.
     pub map: usize,
 }
 
@@ -33,7 +37,7 @@ pub(super) struct PointSum {
     pub taps: Taps,
     /// Output channels.
     pub channels: usize,
-    /// Elements of the planes of a point.
+    /// Length of the planes of a point.
     pub stride: usize,
     pub target: Target,
 }
@@ -51,30 +55,56 @@ struct Column<'a> {
 struct Segment {
     lane: usize,
     count: usize,
-    /// Which rows of the tile the output has.
+    /// The first row of the tile that the output has, and the one behind the last.
     rows: (usize, usize),
-    /// Where the first of these rows lies in the output, of channel 0.
+    /// Offset of the first of these rows in the output, for channel 0.
     out: usize,
 }
 
 /// The segments of a vector.
 #[derive(Clone, Copy)]
 struct Segments {
-    list: [Segment; MOST_LANES],
+    list: [Segment; MAX_LANES],
     count: usize,
 }
 
+per_isa! {
+    /// Computes the rows of a strip from the points of the input, with packed weights from [`PointSum::pack`]. Meanwhile it prefetches
+    /// `upcoming`, the data that is read next.
+    pub(super) fn run<S>(
+        simd: S,
+        sum: &PointSum,
+        strips: &Strips,
+        strip: Strip,
+        points: &[f32],
+        packed: &[f32],
+        out: &mut [f32],
+        upcoming: &[f32],
+    ) {
+        match strips.rows {
+            2 => sum.run_tiles::<S, 2>(simd, strips, strip, points, packed, out, upcoming),
+            _ => sum.run_tiles::<S, 4>(simd, strips, strip, points, packed, out, upcoming),
+        }
+    }
+}
+
 impl PointSum {
-    /// Elements that the packed weights and bias take for tiles of any height.
+    /// Length of the packed weights and bias, enough for tiles of any height.
     pub fn packed_len(&self, rows: usize) -> usize {
-        (self.channels + MOST_CHANNELS) * (self.taps.len() * (rows + 2) + 1)
+        (self.channels + MAX_CHANNELS) * (self.taps.len() * (rows + 2) + 1)
     }
 
-    /// Packs bias (none: 0) and the points of the filters into panels of a tile's channels: the bias, then point by point and
-    /// tap by tap the channels.
-    #[inline(always)]
-    pub fn pack<S: Simd, const M: usize>(&self, _simd: S, bias: Option<&[f32]>, weight: &[f32], packed: &mut [f32]) {
-        let height = tile_height(S::MANY_REGISTERS, self.channels);
+    /// Packs bias (`None`: 0) and the points of the filters for tiles of `rows` rows. Each tile of channels has a panel: the bias of
+    /// its channels, then their weights, point by point and tap by tap.
+    pub fn pack(&self, isa: Isa, rows: usize, bias: Option<&[f32]>, weight: &[f32], packed: &mut [f32]) {
+        match rows {
+            2 => self.pack_tiles::<2>(isa, bias, weight, packed),
+            _ => self.pack_tiles::<4>(isa, bias, weight, packed),
+        }
+    }
+
+    fn pack_tiles<const M: usize>(&self, isa: Isa, bias: Option<&[f32]>, weight: &[f32], packed: &mut [f32]) {
+        let height = tile_height(isa.has_many_registers(), self.channels);
         let of_point = self.taps.len() * height;
         let panels = packed.chunks_exact_mut(height + of_point * (M + 2));
         for (first, panel) in (0..self.channels).step_by(height).zip(panels) {
@@ -102,10 +132,8 @@ impl PointSum {
         }
     }
 
-    /// Computes the rows of a strip from the points of the input and weights from [`PointSum::pack`]; meanwhile `upcoming`, what
-    /// is to be read next, is fetched.
     #[inline(always)]
-    pub fn run<S: Simd, const M: usize>(
+    fn run_tiles<S: Simd, const M: usize>(
         &self,
         simd: S,
         strips: &Strips,
@@ -139,7 +167,7 @@ impl PointSum {
         assert!(packed.len() >= self.channels.div_ceil(MR) * panel_len, "point sum: packed weights are too short");
         let vectors = strips.used(strip).div_ceil(S::LANES);
         let mut next = 0;
-        let mut values = [[[simd.splat(0.0); 3]; MR]; MOST_POINTS];
+        let mut values = [[[simd.splat(0.0); 3]; MR]; MAX_POINTS];
         while next < vectors {
             // Four vectors are better two and two than three and one.
             let count = match vectors - next {
@@ -158,7 +186,7 @@ impl PointSum {
         }
     }
 
-    /// All channels of the `NV` vectors from number `next` on.
+    /// Computes all channels of the `NV` vectors from number `next` on.
     #[inline(always)]
     fn column<S: Simd, const M: usize, const MR: usize, const NV: usize>(
         &self,
@@ -167,16 +195,16 @@ impl PointSum {
         points: &[f32],
         packed: &[f32],
         out: &mut [f32],
-        values: &mut [[[S::V; 3]; MR]; MOST_POINTS],
+        values: &mut [[[S::V; 3]; MR]; MAX_POINTS],
     ) {
         let Column { strips, strip, next } = place;
         let last = (M + 1) * self.stride + (next + NV) * S::LANES + self.taps.farthest;
         assert!(last <= points.len(), "point sum: too few points");
-        let mut segments = [Segments { list: [Segment::default(); MOST_LANES], count: 0 }; NV];
+        let mut segments = [Segments { list: [Segment::default(); MAX_LANES], count: 0 }; NV];
         for v in 0..NV {
             segments[v] = self.segments::<S, M>(strips, strip, (next + v) * S::LANES, out.len());
         }
-        // Whether all is one run of whole rows of whole vectors.
+        // Whether the vectors are one run in whole tiles.
         let plain = self.target.column_step == 1
             && (0..NV).all(|v| {
                 let segment = segments[v].list[0];
@@ -219,7 +247,7 @@ impl PointSum {
             for r in 0..rows {
                 let first_out = segments[0].list[0].out + (first + r) * self.target.map;
                 for v in 0..NV {
-                    let mut m = [simd.splat(0.0); MOST_POINTS];
+                    let mut m = [simd.splat(0.0); MAX_POINTS];
                     for u in 0..M + 2 {
                         m[u] = values[u][r][v];
                     }
@@ -244,7 +272,7 @@ impl PointSum {
         }
     }
 
-    /// Has the lines of a segment's rows fetched that are going to be written.
+    /// Prefetches the cache lines of a segment's rows, which are about to be written.
     #[inline(always)]
     fn prefetch<S: Simd>(&self, simd: S, segment: Segment, channel: usize, out: &[f32]) {
         let at = segment.out + channel * self.target.map;
@@ -267,7 +295,7 @@ impl PointSum {
         out_len: usize,
     ) -> Segments {
         let Target { rows, columns, first, row_step, column_step, map } = &self.target;
-        let mut segments = Segments { list: [Segment::default(); MOST_LANES], count: 0 };
+        let mut segments = Segments { list: [Segment::default(); MAX_LANES], count: 0 };
         let end = (position + S::LANES).min(strips.used(strip));
         let mut at = position;
         while at < end {
@@ -283,7 +311,7 @@ impl PointSum {
                     + (from - columns.start) * column_step;
                 let last =
                     out + (self.channels - 1) * map + (bottom - 1 - top) * row_step + (to - 1 - from) * column_step;
-                assert!(last < out_len && segments.count < MOST_LANES, "point sum: the output is too short");
+                assert!(last < out_len && segments.count < MAX_LANES, "point sum: the output is too short");
                 segments.list[segments.count] = Segment {
                     lane: at - position + from - column,
                     count: to - from,
@@ -306,7 +334,7 @@ impl PointSum {
         &self,
         simd: S,
         segment: Segment,
-        rows: [S::V; transform::MOST_ROWS],
+        rows: [S::V; transform::MAX_ROWS],
         to: *mut f32,
     ) {
         let Segment { lane, count, rows: (top, bottom), .. } = segment;
@@ -325,7 +353,7 @@ impl PointSum {
                 } else if column_step == 2 && lane == 0 {
                     simd.store_every_second(to, rows[i], count);
                 } else {
-                    let mut lanes = [0.0; MOST_LANES];
+                    let mut lanes = [0.0; MAX_LANES];
                     simd.store(lanes.as_mut_ptr(), rows[i]);
                     for (step, value) in lanes[lane..lane + count].iter().enumerate() {
                         *to.add(step * column_step) = *value;

@@ -1,23 +1,22 @@
-//! The transforms of minimal filtering along the rows of a map, F(M, 3) for M of 2 and 4.
+//! The transforms of Winograd minimal filtering F(M, 3) along the rows of a map, for M of 2 and 4.
 //!
-//! M outputs `y[i] = sum over j < 3 of g[j] d[i + j]` are coefficients of a product of polynomials (turned round), and a
+//! The M outputs `y[i] = sum over j < 3 of g[j] d[i + j]` are coefficients of the product of two polynomials, one of them reversed. A
 //! product is known from its values at M + 2 points: 0, 1, -1 and infinity for M = 2, also 2 and -2 for M = 4. So
-//! `y = A' ((G g) * (B' d))` with M + 2 multiplications instead of 3 M. Only filters are multiplied by what is not an
-//! integer.
+//! `y = A' ((G g) * (B' d))`, with M + 2 multiplications instead of 3 M. Only `G` has entries that are not integers.
 //!
 //! S. Winograd, *Arithmetic Complexity of Computations*, 1980; A. Lavin and S. Gray, *Fast Algorithms for Convolutional
-//! Neural Networks*, arXiv:1509.09308. Used along one direction only, the rounding errors of F(4, 3) are 2 to 2.5 times
-//! those of the sum itself, those of F(2, 3) no larger than that.
+//! Neural Networks*, arXiv:1509.09308. Along one direction only, the rounding errors of F(4, 3) are 2 to 2.5 times
+//! those of the direct sum, and those of F(2, 3) are no larger than its own.
 //!
-//! In all functions the first M + 2, M or 3 places of an array count.
+//! All functions use the first M + 2, M or 3 elements of an array.
 
 use crate::simd::Simd;
 
-/// The most points, and the most rows of an input tile.
-pub(super) const MOST_POINTS: usize = 6;
-/// The most rows of an output tile.
-pub(super) const MOST_ROWS: usize = 4;
-/// The point whose value is the sum of all rows, in the output and in its gradient.
+/// The largest number of points, and of rows of an input tile.
+pub(super) const MAX_POINTS: usize = 6;
+/// The largest number of rows of an output tile.
+pub(super) const MAX_ROWS: usize = 4;
+/// The point 1: its value is the sum of all rows, in the output and in the output gradient.
 pub(super) const POINT_ONE: usize = 1;
 
 /// `a + b`.
@@ -40,7 +39,7 @@ fn scaled<S: Simd>(simd: S, a: S::V, factor: f32, b: S::V) -> S::V {
 
 /// `B' d`: rows of the input to points.
 #[inline(always)]
-pub(super) fn input<S: Simd, const M: usize>(simd: S, d: [S::V; MOST_POINTS]) -> [S::V; MOST_POINTS] {
+pub(super) fn input<S: Simd, const M: usize>(simd: S, d: [S::V; MAX_POINTS]) -> [S::V; MAX_POINTS] {
     if M == 2 {
         [minus(simd, d[0], d[2]), add(simd, d[1], d[2]), minus(simd, d[2], d[1]), minus(simd, d[3], d[1]), d[4], d[5]]
     } else {
@@ -59,7 +58,7 @@ pub(super) fn input<S: Simd, const M: usize>(simd: S, d: [S::V; MOST_POINTS]) ->
 
 /// `A' m`: points to rows of the output.
 #[inline(always)]
-pub(super) fn output<S: Simd, const M: usize>(simd: S, m: [S::V; MOST_POINTS]) -> [S::V; MOST_ROWS] {
+pub(super) fn output<S: Simd, const M: usize>(simd: S, m: [S::V; MAX_POINTS]) -> [S::V; MAX_ROWS] {
     let (even, odd) = (add(simd, m[1], m[2]), minus(simd, m[1], m[2]));
     if M == 2 {
         let zero = simd.splat(0.0);
@@ -75,9 +74,9 @@ pub(super) fn output<S: Simd, const M: usize>(simd: S, m: [S::V; MOST_POINTS]) -
     }
 }
 
-/// `A dy`: rows of the output's gradient to points.
+/// `A dy`, the transpose of [`output`]: rows of the output gradient to points.
 #[inline(always)]
-pub(super) fn output_gradient<S: Simd, const M: usize>(simd: S, dy: [S::V; MOST_ROWS]) -> [S::V; MOST_POINTS] {
+pub(super) fn output_gradient<S: Simd, const M: usize>(simd: S, dy: [S::V; MAX_ROWS]) -> [S::V; MAX_POINTS] {
     if M == 2 {
         [dy[0], add(simd, dy[0], dy[1]), minus(simd, dy[0], dy[1]), dy[1], dy[1], dy[1]]
     } else {
@@ -96,7 +95,7 @@ pub(super) fn output_gradient<S: Simd, const M: usize>(simd: S, dy: [S::V; MOST_
 
 /// `G g`: taps of the filter to points.
 #[inline(always)]
-pub(super) fn filter<const M: usize>(g: [f32; 3]) -> [f32; MOST_POINTS] {
+pub(super) fn filter<const M: usize>(g: [f32; 3]) -> [f32; MAX_POINTS] {
     let outer = g[0] + g[2];
     if M == 2 {
         [g[0], (outer + g[1]) * 0.5, (outer - g[1]) * 0.5, g[2], 0.0, 0.0]
@@ -107,9 +106,9 @@ pub(super) fn filter<const M: usize>(g: [f32; 3]) -> [f32; MOST_POINTS] {
     }
 }
 
-/// `G' p`: the gradient of the points of a filter to that of its taps.
+/// `G' p`, the transpose of [`filter`]: the gradient of the points of a filter to that of its taps.
 #[inline(always)]
-pub(super) fn filter_gradient<const M: usize>(p: [f32; MOST_POINTS]) -> [f32; 3] {
+pub(super) fn filter_gradient<const M: usize>(p: [f32; MAX_POINTS]) -> [f32; 3] {
     let (near_even, near_odd) = (p[1] + p[2], p[1] - p[2]);
     if M == 2 {
         [p[0] + 0.5 * near_even, 0.5 * near_odd, p[3] + 0.5 * near_even]
@@ -142,7 +141,7 @@ mod tests {
         let d = [1.0, -2.0, 0.5, 3.0, -0.75, 1.5];
         let dy = [0.25, -1.0, 1.5, 2.0];
         let (filter_points, points) = (filter::<M>(g), on_numbers(d, |d| input::<_, M>(Portable, d)));
-        let mut products = [0.0; MOST_POINTS];
+        let mut products = [0.0; MAX_POINTS];
         (0..M + 2).for_each(|u| products[u] = filter_points[u] * points[u]);
         let y = on_numbers(products, |m| output::<_, M>(Portable, m));
         for i in 0..M {
@@ -150,7 +149,7 @@ mod tests {
             approx::assert_relative_eq!(y[i], expected, epsilon = 1e-5);
         }
         let dy_points = on_numbers(dy, |dy| output_gradient::<_, M>(Portable, dy));
-        let mut products = [0.0; MOST_POINTS];
+        let mut products = [0.0; MAX_POINTS];
         (0..M + 2).for_each(|u| products[u] = dy_points[u] * points[u]);
         let dg = filter_gradient::<M>(products);
         for j in 0..3 {
@@ -158,7 +157,7 @@ mod tests {
             approx::assert_relative_eq!(dg[j], expected, epsilon = 1e-4);
         }
         approx::assert_relative_eq!(dy_points[POINT_ONE], dy[..M].iter().sum::<f32>(), epsilon = 1e-6);
-        // A last tap of 0 leaves the last point out, a first one of 0 the first.
+        // Without its last tap a filter does not need the last point, without its first tap not the first point.
         assert_eq!(filter::<M>([1.0, 2.0, 0.0])[M + 1], 0.0);
         assert_eq!(filter::<M>([0.0, 2.0, 1.0])[0], 0.0);
     }

@@ -1,0 +1,421 @@
+//! Random changes to training images: a horizontal shift, shadows, lines, colours, brightness. Validation and driving never see
+//! them.
+//!
+//! They act on the RGB stage of preprocessing (cropped, before the colour conversion), in this order: shift, shadows,
+//! lines, colours, brightness. Each is drawn anew for every sample and epoch.
+
+use crate::dataset::pictures::preprocess::Preprocessing;
+use crate::engine::random::{below, uniform, unit};
+use crate::{Error, Result};
+use rand::Rng;
+use serde::{Deserialize, Serialize};
+
+/// The `[augmentation]` table of a recipe; everything is off by default.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Augmentation {
+    /// Range of the factor that all grey levels are multiplied by (clamped at 255).
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub brightness: Option<[f64; 2]>,
+    /// Probability of a shadow: one side of a random line from the top to the bottom edge is darkened.
+    pub shadow_probability: f64,
+    /// Probability of a shadow that falls across: a band between the left and the right edge, as of a tree or a post.
+    pub band_probability: f64,
+    /// Range of the factor that grey levels in a shadow are multiplied by; smaller is darker.
+    pub shadow_strength: [f64; 2],
+    /// Largest number of straight lines across the picture that are darkened or lightened: seams, wires, wheel tracks, of which
+    /// none is the edge of the road.
+    pub lines: u32,
+    /// Range of the factor that grey levels in a line are multiplied by (clamped at 255).
+    pub line_strength: [f64; 2],
+    /// Largest shift to the left or right, in source pixels. The edge column fills what comes into view.
+    pub shift_px: f64,
+    /// Steering added for each source pixel that the picture moves to the right: the road seems to lie to the right,
+    /// so the car has to steer there. Needed with `shift_px`; 0.002 to 0.003 is usual.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub shift_steering_per_px: Option<f64>,
+    /// Largest turn of the hue either way, in degrees: a turn about the axis of grays.
+    pub hue_deg: f64,
+    /// Range of the factor of the distance from gray: 0 leaves a gray picture.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub saturation: Option<[f64; 2]>,
+    /// Range of the factors, one for each channel, that red, green and blue are multiplied by: the tint of the light.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub tint: Option<[f64; 2]>,
+    /// Range of the factor of the distance from the picture's mean grey level.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub contrast: Option<[f64; 2]>,
+}
+
+impl Default for Augmentation {
+    fn default() -> Self {
+        Self {
+            brightness: None,
+            shadow_probability: 0.0,
+            band_probability: 0.0,
+            shadow_strength: [0.2, 0.5],
+            lines: 0,
+            line_strength: [0.4, 1.6],
+            shift_px: 0.0,
+            shift_steering_per_px: None,
+            hue_deg: 0.0,
+            saturation: None,
+            tint: None,
+            contrast: None,
+        }
+    }
+}
+
+impl Augmentation {
+    /// Whether anything is changed at all.
+    pub fn is_active(&self) -> bool {
+        self.brightness.is_some()
+            || self.band_probability > 0.0
+            || self.shadow_probability > 0.0
+            || self.shift_px > 0.0
+            || self.lines > 0
+            || self.changes_colours()
+    }
+
+    fn changes_colours(&self) -> bool {
+        self.hue_deg > 0.0 || self.saturation.is_some() || self.tint.is_some() || self.contrast.is_some()
+    }
+
+    /// Checks the numbers.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] naming the key.
+    pub fn validate(&self) -> Result<()> {
+        let wrong = |key: &str, must: &str| Err(Error::Usage(format!("[augmentation] {key}: {must}")));
+        let is_range = |[low, high]: [f64; 2]| 0.0 <= low && low <= high && high <= 10.0;
+        let ranges = [
+            ("brightness", self.brightness),
+            ("shadow_strength", Some(self.shadow_strength)),
+            ("line_strength", Some(self.line_strength)),
+            ("saturation", self.saturation),
+            ("tint", self.tint),
+            ("contrast", self.contrast),
+        ];
+        if let Some((key, _)) = ranges.into_iter().find(|(_, range)| !range.is_none_or(is_range)) {
+            return wrong(key, "must be [low, high] with 0 <= low <= high <= 10");
+        }
+        if self.lines > 100 {
+            return wrong("lines", "must be 0 to 100");
+        }
+        if !(0.0..=180.0).contains(&self.hue_deg) {
+            return wrong("hue_deg", "must be 0 to 180");
+        }
+        if !(0.0..=1.0).contains(&self.shadow_probability) {
+            return wrong("shadow_probability", "must be 0 to 1");
+        }
+        if !(0.0..=1.0).contains(&self.band_probability) {
+            return wrong("band_probability", "must be 0 to 1");
+        }
+        if !(0.0..=1000.0).contains(&self.shift_px) {
+            return wrong("shift_px", "must be 0 to 1000 source pixels");
+        }
+        if self.shift_px > 0.0 && !self.shift_steering_per_px.is_some_and(f64::is_finite) {
+            return wrong("shift_steering_per_px", "must be given with shift_px, for example 0.002");
+        }
+        Ok(())
+    }
+
+    /// Changes `rgb` (`[h][w][3]`, the RGB stage of `preprocessing`) and returns what is added to the steering.
+    pub fn apply(&self, preprocessing: &Preprocessing, rgb: &mut [u8], rng: &mut impl Rng) -> f32 {
+        let [_, width] = preprocessing.rgb_size();
+        let mut steering = 0.0;
+        if let Some(per_px) = self.shift_steering_per_px.filter(|_| self.shift_px > 0.0) {
+            // Whole pixels of the stage, so that picture and label agree exactly.
+            let source_px = preprocessing.source_px_per_rgb_px();
+            let columns = (uniform(rng, -self.shift_px, self.shift_px) / source_px).round();
+            shift(rgb, width, columns as isize);
+            steering = (columns * source_px * per_px) as f32;
+        }
+        if self.shadow_probability > 0.0 {
+            // All numbers are drawn in any case, so that one setting does not disturb the numbers of the next.
+            let [chance, top, bottom, side] = [unit(rng), unit(rng), unit(rng), unit(rng)];
+            let factor = uniform(rng, self.shadow_strength[0], self.shadow_strength[1]);
+            if chance < self.shadow_probability {
+                shadow(rgb, width, top, bottom, side < 0.5, &factors(factor));
+            }
+        }
+        if self.band_probability > 0.0 {
+            let [chance, from, length, height, thickness] = [(); 5].map(|()| unit(rng));
+            let tilt = uniform(rng, -0.5, 0.5);
+            let factor = uniform(rng, self.shadow_strength[0], self.shadow_strength[1]);
+            if chance < self.band_probability {
+                let band =
+                    Band { from: from - 0.3, length: 0.3 + length, height, tilt, thickness: 0.02 + 0.23 * thickness };
+                band.darken(rgb, width, &factors(factor));
+            }
+        }
+        for _ in 0..below(rng, self.lines as usize + 1) {
+            // From anywhere at the horizon or beside the picture to anywhere near the car.
+            let [top, bottom, wide] = [unit(rng), uniform(rng, -1.0, 2.0), unit(rng)];
+            let table = factors(uniform(rng, self.line_strength[0], self.line_strength[1]));
+            line(rgb, width, top, bottom, wide, &table);
+        }
+        if self.changes_colours() {
+            let drawn = |range: Option<[f64; 2]>, rng: &mut _| {
+                let [low, high] = range.unwrap_or([1.0, 1.0]);
+                uniform(rng, low, high)
+            };
+            let turn = uniform(rng, -self.hue_deg, self.hue_deg).to_radians();
+            let saturation = drawn(self.saturation, rng);
+            let tint = [(); 3].map(|()| drawn(self.tint, rng));
+            let contrast = drawn(self.contrast, rng);
+            recolour(rgb, turn, saturation, tint, contrast);
+        }
+        if let Some([low, high]) = self.brightness {
+            let table = factors(uniform(rng, low, high));
+            rgb.iter_mut().for_each(|grey| *grey = table[usize::from(*grey)]);
+        }
+        steering
+    }
+}
+
+/// Grey levels times `factor`, rounded and clamped.
+fn factors(factor: f64) -> [u8; 256] {
+    std::array::from_fn(|grey| (grey as f64 * factor).round().min(255.0) as u8)
+}
+
+/// Moves the picture `columns` to the right (to the left if negative) and repeats the edge column.
+fn shift(rgb: &mut [u8], width: usize, columns: isize) {
+    let by = columns.unsigned_abs().min(width - 1);
+    for row in rgb.chunks_exact_mut(width * 3) {
+        if columns > 0 {
+            row.copy_within(..(width - by) * 3, by * 3);
+            for column in 0..by {
+                row.copy_within(by * 3..by * 3 + 3, column * 3);
+            }
+        } else {
+            row.copy_within(by * 3.., 0);
+            for column in width - by..width {
+                row.copy_within((width - by - 1) * 3..(width - by) * 3, column * 3);
+            }
+        }
+    }
+}
+
+/// Darkens what lies left (or right) of the line from `top` to `bottom`, both shares of the width.
+fn shadow(rgb: &mut [u8], width: usize, top: f64, bottom: f64, left: bool, table: &[u8; 256]) {
+    let rows = rgb.len() / (width * 3);
+    for (y, row) in rgb.chunks_exact_mut(width * 3).enumerate() {
+        let along = (y as f64 + 0.5) / rows as f64;
+        let edge = ((top + (bottom - top) * along) * width as f64).round() as usize * 3;
+        let (before, after) = row.split_at_mut(edge);
+        let dark = if left { before } else { after };
+        dark.iter_mut().for_each(|grey| *grey = table[usize::from(*grey)]);
+    }
+}
+
+/// A band across the picture, in shares of its width and height.
+struct Band {
+    /// Where it begins, from the left edge.
+    from: f64,
+    /// How far it reaches to the right.
+    length: f64,
+    /// Its middle at the left edge, from the top.
+    height: f64,
+    /// How much lower its middle is at the right edge.
+    tilt: f64,
+    /// From its upper to its lower rim.
+    thickness: f64,
+}
+
+impl Band {
+    fn darken(&self, rgb: &mut [u8], width: usize, table: &[u8; 256]) {
+        let rows = rgb.len() / (width * 3);
+        let column_at = |share: f64| ((share * width as f64).round().max(0.0) as usize).min(width);
+        for x in column_at(self.from)..column_at(self.from + self.length) {
+            let middle = self.height + self.tilt * (x as f64 + 0.5) / width as f64;
+            let row_at = |share: f64| ((share * rows as f64).round().max(0.0) as usize).min(rows);
+            for y in row_at(middle - 0.5 * self.thickness)..row_at(middle + 0.5 * self.thickness) {
+                let at = (y * width + x) * 3;
+                rgb[at..at + 3].iter_mut().for_each(|grey| *grey = table[usize::from(*grey)]);
+            }
+        }
+    }
+}
+
+/// Darkens or lightens a line from `top` at the upper rim to `bottom` at the lower, both shares of the width. It is drawn in
+/// perspective: fine above, up to 4 pixels wide below for `wide` 1.
+fn line(rgb: &mut [u8], width: usize, top: f64, bottom: f64, wide: f64, table: &[u8; 256]) {
+    let rows = rgb.len() / (width * 3);
+    for (y, row) in rgb.chunks_exact_mut(width * 3).enumerate() {
+        let along = (y as f64 + 0.5) / rows as f64;
+        let from = (top + (bottom - top) * along) * width as f64;
+        let to = from + 0.7 + 3.3 * wide * along;
+        let [from, to] = [from, to].map(|column| column.round().clamp(0.0, width as f64) as usize * 3);
+        row[from..to].iter_mut().for_each(|grey| *grey = table[usize::from(*grey)]);
+    }
+}
+
+/// Turns the hue by `turn` rad, multiplies the distance from gray by `saturation` and each channel by its `tint`, then the
+/// distance from the mean grey level by `contrast`.
+///
+/// The turn is about the axis of grays in RGB (Rodrigues' formula with the axis (1, 1, 1) / sqrt 3): it keeps the sum of the
+/// three channels.
+fn recolour(rgb: &mut [u8], turn: f64, saturation: f64, tint: [f64; 3], contrast: f64) {
+    let (sin, cos) = turn.sin_cos();
+    let (along, aside) = ((1.0 - saturation * cos) / 3.0, saturation * sin / 3f64.sqrt());
+    // The matrix is circulant: the diagonal, then the two others in turn.
+    let (d, a, b) = (saturation * cos + along, along - aside, along + aside);
+    let rows = [[d, a, b], [b, d, a], [a, b, d]];
+    let sums = rgb.chunks_exact(3).fold([0u64; 3], |sums, px| std::array::from_fn(|k| sums[k] + u64::from(px[k])));
+    let means = sums.map(|sum| sum as f64 / (rgb.len() / 3).max(1) as f64);
+    let dot = |row: &[f64; 3]| row[0] * means[0] + row[1] * means[1] + row[2] * means[2];
+    let grey = (0..3).map(|k| tint[k] * dot(&rows[k])).sum::<f64>() / 3.0;
+    let rows: [[f32; 3]; 3] = std::array::from_fn(|k| rows[k].map(|v| (v * tint[k] * contrast) as f32));
+    // Half a grey level more, as the conversion to bytes cuts off.
+    let offset = (grey * (1.0 - contrast) + 0.5) as f32;
+    for px in rgb.chunks_exact_mut(3) {
+        let [r, g, b] = [f32::from(px[0]), f32::from(px[1]), f32::from(px[2])];
+        for (out, [wr, wg, wb]) in px.iter_mut().zip(&rows) {
+            *out = (wr * r + wg * g + wb * b + offset) as u8;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::engine::random::{Purpose, rng};
+
+    fn preprocessing() -> Preprocessing {
+        Preprocessing { source: [8, 20], rows: [0, 8], resize: [4, 10], ..Default::default() }
+    }
+
+    /// A picture whose grey level is ten times the column.
+    fn columns() -> Vec<u8> {
+        (0..4 * 10).flat_map(|i| [(i % 10 * 10) as u8; 3]).collect()
+    }
+
+    #[test]
+    fn the_label_moves_with_the_picture() {
+        let augmentation = Augmentation { shift_px: 6.0, shift_steering_per_px: Some(0.01), ..Default::default() };
+        let mut seen = std::collections::BTreeSet::new();
+        for stream in 0..200 {
+            let mut rgb = columns();
+            let steering = augmentation.apply(&preprocessing(), &mut rgb, &mut rng(1, Purpose::Test, 0, stream));
+            // One column of the stage is two source pixels. Column 5 shows what was `moved` columns to its left.
+            let moved = (steering / 0.02).round() as i32;
+            assert!((steering - moved as f32 * 0.02).abs() < 1e-6 && moved.abs() <= 3);
+            assert_eq!(i32::from(rgb[15]), 50 - 10 * moved);
+            assert_eq!(i32::from(rgb[0]), (-10 * moved).max(0));
+            assert_eq!(i32::from(rgb[27]), (90 - 10 * moved).min(90));
+            seen.insert(moved);
+        }
+        assert_eq!(seen.len(), 7);
+    }
+
+    #[test]
+    fn brightness_scales_and_clamps() {
+        let augmentation = Augmentation { brightness: Some([1.5, 1.5]), ..Default::default() };
+        let mut rgb = [0, 100, 200, 255].repeat(30);
+        assert_eq!(augmentation.apply(&preprocessing(), &mut rgb, &mut rng(1, Purpose::Test, 0, 0)), 0.0);
+        assert_eq!(rgb[..4], [0, 150, 255, 255]);
+    }
+
+    #[test]
+    fn shadows_fall_on_one_side_as_often_as_asked() {
+        let augmentation = Augmentation { shadow_probability: 0.25, shadow_strength: [0.5, 0.5], ..Default::default() };
+        let mut shadows = 0;
+        for stream in 0..2000 {
+            let mut rgb = vec![100; 4 * 10 * 3];
+            augmentation.apply(&preprocessing(), &mut rgb, &mut rng(2, Purpose::Test, 0, stream));
+            shadows += usize::from(rgb.contains(&50));
+            for row in rgb.chunks_exact(30) {
+                assert!(row.iter().all(|&grey| grey == 50 || grey == 100));
+                assert!(row.windows(2).filter(|pair| pair[0] != pair[1]).count() <= 1);
+            }
+        }
+        // A line near the border can leave the picture as it is, so a few less than 500.
+        assert!((400..=560).contains(&shadows), "{shadows}");
+    }
+
+    #[test]
+    fn bands_darken_what_lies_between_their_rims() {
+        let mut rgb = vec![100; 4 * 10 * 3];
+        let band = Band { from: 0.3, length: 0.5, height: 0.25, tilt: 0.5, thickness: 0.5 };
+        band.darken(&mut rgb, 10, &factors(0.5));
+        let dark = |y: usize| (0..10).filter(|x| rgb[(y * 10 + x) * 3] == 50).collect::<Vec<_>>();
+        // Columns 3 to 7; two of four rows, lower to the right: the middle is at 0.25 + 0.05 (x + 0.5).
+        assert_eq!([dark(0), dark(1), dark(2), dark(3)], [vec![], vec![3, 4, 5, 6], vec![3, 4, 5, 6, 7], vec![7]]);
+        let bands = Augmentation { band_probability: 0.5, shadow_strength: [0.5, 0.5], ..Default::default() };
+        assert!(bands.is_active() && bands.validate().is_ok());
+        let mut seen = 0;
+        for stream in 0..1000 {
+            let mut rgb = vec![100; 4 * 10 * 3];
+            assert_eq!(bands.apply(&preprocessing(), &mut rgb, &mut rng(4, Purpose::Test, 0, stream)), 0.0);
+            seen += usize::from(rgb.contains(&50));
+        }
+        // Thin bands and those beside the picture may touch no pixel.
+        assert!((250..=520).contains(&seen), "{seen}");
+    }
+
+    #[test]
+    fn lines_are_narrow_and_not_more_than_asked_for() {
+        let lines = Augmentation { lines: 2, line_strength: [0.5, 0.5], ..Default::default() };
+        assert!(lines.is_active());
+        let mut seen = std::collections::BTreeSet::new();
+        for stream in 0..500 {
+            let mut rgb = vec![100; 4 * 10 * 3];
+            assert_eq!(lines.apply(&preprocessing(), &mut rgb, &mut rng(3, Purpose::Test, 0, stream)), 0.0);
+            // Where two lines cross, grey levels are halved twice.
+            assert!(rgb.iter().all(|grey| [100, 50, 25].contains(grey)));
+            let dark = rgb.chunks_exact(30).map(|row| row.iter().filter(|&&grey| grey < 100).count() / 3).max();
+            assert!(dark <= Some(8), "{dark:?}");
+            seen.insert(dark);
+        }
+        assert!(seen.contains(&Some(0)) && seen.len() > 3, "{seen:?}");
+    }
+
+    #[test]
+    fn colours_turn_about_the_axis_of_grays_and_spread_about_the_mean() {
+        let changed = |turn_deg: f64, saturation, tint, contrast| {
+            let mut rgb = vec![200, 80, 40, 90, 90, 90];
+            recolour(&mut rgb, turn_deg.to_radians(), saturation, tint, contrast);
+            rgb
+        };
+        assert_eq!(changed(0.0, 1.0, [1.0; 3], 1.0), [200, 80, 40, 90, 90, 90]);
+        // A third of the circle makes green of red, and so on; grays stay.
+        assert_eq!(changed(120.0, 1.0, [1.0; 3], 1.0), [40, 200, 80, 90, 90, 90]);
+        assert_eq!(changed(0.0, 0.0, [1.0; 3], 1.0), [107, 107, 107, 90, 90, 90]);
+        assert_eq!(changed(0.0, 1.0, [1.1, 1.0, 0.5], 1.0), [220, 80, 20, 99, 90, 45]);
+        // The mean grey level is 98.3.
+        assert_eq!(changed(0.0, 1.0, [1.0; 3], 0.5), [149, 89, 69, 94, 94, 94]);
+        assert_eq!(changed(0.0, 1.0, [1.0; 3], 2.0), [255, 62, 0, 82, 82, 82]);
+        let turned = changed(40.0, 0.8, [1.0; 3], 1.0);
+        assert!((turned[..3].iter().map(|&c| i32::from(c)).sum::<i32>() - 320).abs() <= 1, "{turned:?}");
+    }
+
+    #[test]
+    fn colours_are_drawn_anew_and_without_them_nothing_changes() {
+        let table = "hue_deg = 40\nsaturation = [0.2, 1.5]\ntint = [0.8, 1.2]\ncontrast = [0.5, 1.5]";
+        let colours: Augmentation = toml::from_str(table).unwrap();
+        assert!(colours.is_active() && colours.validate().is_ok());
+        let draw = |augmentation: &Augmentation, stream| {
+            let mut rgb: Vec<u8> = (0..4 * 10 * 3).map(|i| (i * 2) as u8).collect();
+            assert_eq!(augmentation.apply(&preprocessing(), &mut rgb, &mut rng(1, Purpose::Test, 0, stream)), 0.0);
+            rgb
+        };
+        assert_ne!(draw(&colours, 0), draw(&colours, 1));
+        assert_eq!(draw(&colours, 0), draw(&colours, 0));
+        assert_eq!(draw(&Augmentation::default(), 0)[..4], [0, 2, 4, 6]);
+    }
+
+    #[test]
+    fn tables_are_checked() {
+        assert!(!Augmentation::default().is_active() && Augmentation::default().validate().is_ok());
+        let shift: Augmentation = toml::from_str("shift_px = 50").unwrap();
+        assert!(shift.is_active() && shift.validate().unwrap_err().to_string().contains("shift_steering_per_px"));
+        assert!(toml::from_str::<Augmentation>("brightness = [1.2, 0.8]").unwrap().validate().is_err());
+        assert!(toml::from_str::<Augmentation>("blur = 1").is_err());
+        for wrong in ["hue_deg = 200", "saturation = [-1, 1]", "tint = [1, 0.5]", "contrast = [0, 11]"] {
+            let key = wrong.split(' ').next().unwrap();
+            let error = toml::from_str::<Augmentation>(wrong).unwrap().validate().unwrap_err().to_string();
+            assert!(error.contains(key), "{error}");
+        }
+    }
+}

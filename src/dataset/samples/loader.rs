@@ -1,0 +1,443 @@
+//! Batches for training and validation: decoded once, cached, augmented, ready for the network.
+//!
+//! [`Loader::fill`] makes one batch on the threads of the rayon pool it is called from, so it can run beside the training
+//! step of the batch before (`rayon::join`). What a batch holds depends on the seed, the epoch and its number, not on
+//! threads, cache or order of calls.
+
+use super::augment::Augmentation;
+use super::leak::{NearTwins, Thumbnail};
+use super::split::Split;
+use super::{Flip, Group, Item, SampleSpec};
+use crate::dataset::pictures::cache::{CacheSpec, ImageCache};
+use crate::dataset::pictures::preprocess::{Preprocessing, Preprocessor};
+use crate::dataset::recording::{Recording, View};
+use crate::engine::random::{Purpose, rng, shuffle, unit};
+use crate::engine::stopwatch::Stopwatch;
+use crate::picture::{RgbImage, decode::decode_rgb};
+use crate::{Error, Result};
+use rayon::prelude::*;
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::Read;
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+
+/// Everything that decides what batches look like.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LoaderSpec {
+    /// From image to network input.
+    pub preprocessing: Preprocessing,
+    /// Cameras and mirrors.
+    pub samples: SampleSpec,
+    /// Random changes to training images.
+    pub augmentation: Augmentation,
+    /// Images in a batch. With [`Group::Rows`] a batch holds as many whole rows as fit, at least one.
+    pub batch: usize,
+    /// Seed of the run.
+    pub seed: u64,
+    /// How much is kept, and where.
+    pub cache: CacheSpec,
+}
+
+/// Which image a sample shows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct SampleId {
+    /// Which recording.
+    pub recording: u16,
+    /// Which row of it.
+    pub row: u32,
+    /// Which camera.
+    pub camera: View,
+    /// Whether the image is mirrored, and the label negated.
+    pub mirrored: bool,
+}
+
+/// Samples for one step. The buffers are reused from batch to batch.
+#[derive(Debug, Clone, Default)]
+pub struct Batch {
+    /// Network input, `[n][c][h][w]`.
+    pub x: Vec<f32>,
+    /// Labels, `[n]`: steering with the corrections of camera and shift, + = right, not clamped.
+    pub labels: Vec<f32>,
+    /// Number of samples; less than asked for at the end of an epoch, and where images cannot be decoded.
+    pub n: usize,
+    /// Where each sample comes from, `[n]`.
+    pub samples: Vec<SampleId>,
+    /// Sample numbers of the loader and whether they could be decoded; kept to be used again.
+    work: Vec<(u32, bool)>,
+}
+
+/// Makes the batches of one side of a split.
+#[derive(Debug)]
+pub struct Loader {
+    recordings: Arc<[Recording]>,
+    spec: LoaderSpec,
+    /// Only the training side shuffles, mirrors at random and augments.
+    training: bool,
+    flip: Flip,
+    items: Vec<Item>,
+    /// Each image: its item and camera. Images of an item stand together.
+    images: Vec<(u32, View)>,
+    /// First image of each item, and their number at the end.
+    first_images: Vec<u32>,
+    /// What is taken in this order: samples, or items with [`Group::Rows`].
+    order: Vec<u32>,
+    epoch: u64,
+    cache: ImageCache,
+    thumbnails: Vec<OnceLock<Thumbnail>>,
+    undecodable: Mutex<BTreeMap<u32, String>>,
+    scratch: Mutex<Vec<Scratch>>,
+    times: LoaderTimes,
+}
+
+/// Where the time of making samples goes, summed over threads; nothing is measured by default.
+#[derive(Debug, Clone, Default)]
+pub struct LoaderTimes {
+    /// Reading and decoding files.
+    pub decode: Stopwatch,
+    /// Crop, size, colour, scaling, mirroring.
+    pub preprocess: Stopwatch,
+    /// Random changes.
+    pub augment: Stopwatch,
+}
+
+/// Buffers of one thread.
+#[derive(Debug)]
+struct Scratch {
+    file: Vec<u8>,
+    image: RgbImage,
+    preprocessor: Preprocessor,
+    cached: Vec<u8>,
+    rgb: Vec<u8>,
+    planes: Vec<u8>,
+}
+
+impl Loader {
+    /// Loaders of both sides of `split`; they share the memory budget in proportion to what they hold.
+    ///
+    /// # Errors
+    /// If a table of `spec` is wrong, or if the cache file cannot be created.
+    pub fn pair(recordings: &Arc<[Recording]>, split: &Split, spec: &LoaderSpec) -> Result<(Loader, Loader)> {
+        let bytes = |training: bool, items: &[Item]| {
+            let images: usize = items.iter().map(|item| item.cameras().count()).sum();
+            images * cached_len(spec, training)
+        };
+        let (training, validation) = (bytes(true, &split.training), bytes(false, &split.validation));
+        let share = training as f64 / (training + validation).max(1) as f64;
+        let for_training = ((spec.cache.memory_bytes as f64 * share) as usize).min(spec.cache.memory_bytes);
+        let with =
+            |memory_bytes| LoaderSpec { cache: CacheSpec { memory_bytes, ..spec.cache.clone() }, ..spec.clone() };
+        Ok((
+            Loader::training(recordings, split, &with(for_training))?,
+            Loader::validation(recordings, split, &with(spec.cache.memory_bytes - for_training))?,
+        ))
+    }
+
+    /// The training side: shuffled in every epoch, mirrored and augmented as `spec` says.
+    ///
+    /// # Errors
+    /// As [`Loader::pair`].
+    pub fn training(recordings: &Arc<[Recording]>, split: &Split, spec: &LoaderSpec) -> Result<Loader> {
+        Self::new(recordings, &split.training, spec, true, spec.samples.flip)
+    }
+
+    /// The validation side: in the order of the log, never augmented.
+    ///
+    /// # Errors
+    /// As [`Loader::pair`].
+    pub fn validation(recordings: &Arc<[Recording]>, split: &Split, spec: &LoaderSpec) -> Result<Loader> {
+        let flip = if spec.samples.validation_flips { Flip::Both } else { Flip::None };
+        Self::new(recordings, &split.validation, spec, false, flip)
+    }
+
+    fn new(
+        recordings: &Arc<[Recording]>,
+        items: &[Item],
+        spec: &LoaderSpec,
+        training: bool,
+        flip: Flip,
+    ) -> Result<Loader> {
+        spec.preprocessing.validate()?;
+        spec.samples.validate()?;
+        spec.augmentation.validate()?;
+        if spec.batch == 0 {
+            return Err(Error::Usage("a batch must hold at least one image".into()));
+        }
+        let mut images = Vec::new();
+        let mut first_images = vec![0];
+        for (i, item) in items.iter().enumerate() {
+            images.extend(item.cameras().map(|camera| (i as u32, camera)));
+            first_images.push(images.len() as u32);
+        }
+        let mut loader = Loader {
+            recordings: Arc::clone(recordings),
+            training,
+            flip,
+            cache: ImageCache::new(images.len(), cached_len(spec, training), &spec.cache)?,
+            thumbnails: items.iter().map(|_| OnceLock::new()).collect(),
+            items: items.to_vec(),
+            images,
+            first_images,
+            order: Vec::new(),
+            epoch: 0,
+            undecodable: Mutex::default(),
+            scratch: Mutex::default(),
+            times: LoaderTimes::default(),
+            spec: spec.clone(),
+        };
+        loader.begin_epoch(0);
+        Ok(loader)
+    }
+
+    /// Adds the time that samples take from now on to `times`.
+    pub fn measure(&mut self, times: &LoaderTimes) {
+        self.times = times.clone();
+    }
+
+    /// Number of images, mirrors not counted.
+    pub fn images(&self) -> usize {
+        self.images.len()
+    }
+
+    /// Number of samples in an epoch: images, twice if each is also mirrored.
+    pub fn samples(&self) -> usize {
+        self.images.len() * self.variants()
+    }
+
+    /// Number of batches in an epoch.
+    pub fn batches(&self) -> usize {
+        self.order.len().div_ceil(self.per_batch())
+    }
+
+    /// Shape of a sample: channels, height, width.
+    pub fn shape(&self) -> [usize; 3] {
+        self.spec.preprocessing.output()
+    }
+
+    /// Sets the order of the samples and the random choices of `epoch`.
+    pub fn begin_epoch(&mut self, epoch: u32) {
+        self.epoch = u64::from(epoch);
+        let count = match self.spec.samples.group {
+            Group::Images => self.samples(),
+            Group::Rows => self.items.len(),
+        };
+        self.order.clear();
+        self.order.extend(0..count as u32);
+        if self.training {
+            shuffle(&mut rng(self.spec.seed, Purpose::Shuffle, self.epoch, 0), &mut self.order);
+        }
+    }
+
+    /// Fills `out` with batch number `batch` of the epoch. Allocates nothing once all images are cached and `out` has
+    /// held a full batch.
+    ///
+    /// # Errors
+    /// If the cache file fails. An image that cannot be decoded is no error: it is left out and counted.
+    ///
+    /// # Panics
+    /// If there is no such batch.
+    pub fn fill(&self, batch: usize, out: &mut Batch) -> Result<()> {
+        let per_batch = self.per_batch();
+        let taken = &self.order[batch * per_batch..self.order.len().min((batch + 1) * per_batch)];
+        let variants = self.variants() as u32;
+        out.work.clear();
+        match self.spec.samples.group {
+            Group::Images => out.work.extend(taken.iter().map(|&sample| (sample, false))),
+            Group::Rows => {
+                for &item in taken {
+                    let images = self.first_images[item as usize]..self.first_images[item as usize + 1];
+                    out.work.extend((images.start * variants..images.end * variants).map(|sample| (sample, false)));
+                }
+            }
+        }
+        let len = self.spec.preprocessing.output_len();
+        out.n = out.work.len();
+        out.x.resize(out.n * len, 0.0);
+        out.labels.resize(out.n, 0.0);
+        let samples = out.x.par_chunks_exact_mut(len).zip(&mut out.labels).zip(&mut out.work);
+        samples.try_for_each(|((x, label), (sample, decoded))| -> Result<()> {
+            let made = self.with_scratch(|scratch| self.make_sample(*sample, x, scratch))??;
+            (*label, *decoded) = (made.unwrap_or(0.0), made.is_some());
+            Ok(())
+        })?;
+        self.close_gaps(out);
+        Ok(())
+    }
+
+    /// Images that could not be decoded so far: their number, and the first few with their paths.
+    pub fn undecodable(&self) -> (usize, Vec<String>) {
+        let undecodable = lock(&self.undecodable);
+        (undecodable.len(), undecodable.values().take(3).cloned().collect())
+    }
+
+    /// How many frames of this (validation) loader have a near twin in `training`. Frames are known once they were
+    /// decoded, so this is to be asked after the first epoch.
+    pub fn near_twins(&self, training: &Loader) -> NearTwins {
+        let seen = |loader: &'_ Loader| loader.thumbnails.iter().filter_map(OnceLock::get).cloned().collect::<Vec<_>>();
+        let (validation, training) = (seen(self), seen(training));
+        NearTwins::count(&validation.iter().collect::<Vec<_>>(), &training.iter().collect::<Vec<_>>())
+    }
+
+    fn variants(&self) -> usize {
+        if self.flip == Flip::Both { 2 } else { 1 }
+    }
+
+    /// How many entries of `order` make a batch.
+    fn per_batch(&self) -> usize {
+        match self.spec.samples.group {
+            Group::Images => self.spec.batch,
+            Group::Rows => {
+                let cameras = self.first_images.windows(2).map(|pair| pair[1] - pair[0]).max().unwrap_or(1);
+                (self.spec.batch / (cameras as usize * self.variants()).max(1)).max(1)
+            }
+        }
+    }
+
+    /// Writes a sample's network input to `x` and returns its label; `None` if the image cannot be decoded.
+    fn make_sample(&self, sample: u32, x: &mut [f32], scratch: &mut Scratch) -> Result<Option<f32>> {
+        let image = sample / self.variants() as u32;
+        let Scratch { file, image: decoded, preprocessor, cached, rgb, planes } = scratch;
+        let made = self.cache.get(image as usize, cached, |out| {
+            self.decode(image, file, decoded, preprocessor, out).map_err(|message| self.report(image, message)).is_ok()
+        })?;
+        let Some(made) = made else { return Ok(None) };
+        let preprocessing = &self.spec.preprocessing;
+        let (item, camera) = self.images[image as usize];
+        let mut label = self.spec.samples.label(self.items[item as usize].steering(&self.recordings), camera);
+        let augmented = keeps_rgb(&self.spec, self.training);
+        if augmented {
+            label += self.times.augment.time(|| {
+                rgb.copy_from_slice(made);
+                let mut rng = rng(self.spec.seed, Purpose::Augment, self.epoch, u64::from(sample));
+                self.spec.augmentation.apply(preprocessing, rgb, &mut rng)
+            });
+        }
+        self.times.preprocess.time(|| {
+            if augmented {
+                preprocessor.finish(rgb, planes);
+            } else {
+                planes.copy_from_slice(made);
+            }
+            if self.is_mirrored(sample) {
+                planes.chunks_exact_mut(preprocessing.resize[1]).for_each(<[u8]>::reverse);
+                label = -label;
+            }
+            preprocessing.to_input(planes, x);
+        });
+        Ok(Some(label))
+    }
+
+    fn is_mirrored(&self, sample: u32) -> bool {
+        match self.flip {
+            Flip::None => false,
+            Flip::Both => sample % 2 == 1,
+            Flip::Random => unit(&mut rng(self.spec.seed, Purpose::Mirror, self.epoch, u64::from(sample))) < 0.5,
+        }
+    }
+
+    /// Reads, decodes and preprocesses an image, up to the stage that is cached.
+    fn decode(
+        &self,
+        image: u32,
+        file: &mut Vec<u8>,
+        decoded: &mut RgbImage,
+        preprocessor: &mut Preprocessor,
+        out: &mut [u8],
+    ) -> std::result::Result<(), String> {
+        let (item, camera) = self.images[image as usize];
+        let Item { recording, row, .. } = self.items[item as usize];
+        let path = self.recordings[usize::from(recording)].image_path(row as usize, camera).ok_or("no such image")?;
+        let failed = |message: String| format!("{}: {message}", path.display());
+        self.times.decode.time(|| {
+            file.clear();
+            File::open(&path)
+                .and_then(|mut input| input.read_to_end(file))
+                .map_err(|error| failed(error.to_string()))?;
+            decode_rgb(file, decoded).map_err(failed)
+        })?;
+        if preprocessor.image_size() != [decoded.height, decoded.width] {
+            let planned = self.spec.preprocessing.plan(decoded.height, decoded.width);
+            *preprocessor = planned.map_err(|error| failed(error.to_string()))?;
+        }
+        if camera == View::Centre {
+            let Preprocessing { rows, source, .. } = self.spec.preprocessing;
+            self.thumbnails[item as usize].get_or_init(|| Thumbnail::of(decoded, rows, source[0]));
+        }
+        self.times.preprocess.time(|| {
+            if keeps_rgb(&self.spec, self.training) {
+                preprocessor.to_rgb_stage(&decoded.pixels, out);
+            } else {
+                preprocessor.apply(&decoded.pixels, out);
+            }
+        });
+        Ok(())
+    }
+
+    fn report(&self, image: u32, message: String) {
+        lock(&self.undecodable).insert(image, message);
+    }
+
+    /// Moves samples up to where others could not be decoded, and notes where the rest come from.
+    fn close_gaps(&self, out: &mut Batch) {
+        let len = self.spec.preprocessing.output_len();
+        let mut n = 0;
+        out.samples.clear();
+        for i in 0..out.n {
+            let (sample, decoded) = out.work[i];
+            if !decoded {
+                continue;
+            }
+            if n < i {
+                out.x.copy_within(i * len..(i + 1) * len, n * len);
+                out.labels[n] = out.labels[i];
+            }
+            let (item, camera) = self.images[sample as usize / self.variants()];
+            let Item { recording, row, .. } = self.items[item as usize];
+            out.samples.push(SampleId { recording, row, camera, mirrored: self.is_mirrored(sample) });
+            n += 1;
+        }
+        out.n = n;
+        out.x.truncate(n * len);
+        out.labels.truncate(n);
+    }
+
+    /// Runs `work` with buffers that no other thread uses.
+    fn with_scratch<T>(&self, work: impl FnOnce(&mut Scratch) -> T) -> Result<T> {
+        let held = lock(&self.scratch).pop();
+        let mut scratch = match held {
+            Some(scratch) => scratch,
+            None => {
+                let spec = &self.spec.preprocessing;
+                Scratch {
+                    file: Vec::new(),
+                    image: RgbImage::default(),
+                    preprocessor: spec.plan(spec.source[0], spec.source[1])?,
+                    cached: vec![0; cached_len(&self.spec, self.training)],
+                    rgb: vec![0; spec.rgb_len()],
+                    planes: vec![0; spec.output_len()],
+                }
+            }
+        };
+        let result = work(&mut scratch);
+        lock(&self.scratch).push(scratch);
+        Ok(result)
+    }
+}
+
+/// Whether images are cached at the RGB stage, because they are augmented in each epoch.
+fn keeps_rgb(spec: &LoaderSpec, training: bool) -> bool {
+    training && spec.augmentation.is_active()
+}
+
+/// Bytes of a cached image.
+fn cached_len(spec: &LoaderSpec, training: bool) -> usize {
+    if keeps_rgb(spec, training) { spec.preprocessing.rgb_len() } else { spec.preprocessing.output_len() }
+}
+
+/// Every state of the guarded data is whole, so a thread that died with the lock does no harm.
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+#[cfg(test)]
+#[path = "loader_tests.rs"]
+mod tests;

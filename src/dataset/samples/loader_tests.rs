@@ -1,0 +1,233 @@
+use super::*;
+use crate::dataset::cache::Overflow;
+use crate::dataset::colour::Colour;
+use crate::dataset::load;
+use crate::dataset::samples::Balance;
+use crate::dataset::split::{SplitMode, SplitSpec, split};
+use crate::dataset::testing::jpeg_of;
+use std::fs;
+use std::path::Path;
+
+/// A drive of `rows` rows at 10 Hz whose images differ from row to row and from camera to camera.
+fn drive(folder: &Path, rows: usize) {
+    fs::create_dir_all(folder.join("IMG")).unwrap();
+    let mut text = String::new();
+    for i in 0..rows {
+        let time = format!("2020_01_01_10_{:02}_{:02}_{:03}", i / 600, i / 10 % 60, i % 10 * 100);
+        for (c, camera) in ["center", "left", "right"].into_iter().enumerate() {
+            let pixels: Vec<u8> = (0..16 * 24)
+                .flat_map(|p| [(p % 24 * 10) as u8, stripe(p % 24 / 4, i), (c * 80 + p / 24) as u8])
+                .collect();
+            fs::write(folder.join("IMG").join(format!("{camera}_{time}.jpg")), jpeg_of(24, 16, &pixels)).unwrap();
+        }
+        let steering = (i % 21) as f32 / 10.0 - 1.0;
+        text += &format!("center_{time}.jpg,left_{time}.jpg,right_{time}.jpg,{steering},1,0,9\n");
+    }
+    fs::write(folder.join("driving_log.csv"), text).unwrap();
+}
+
+fn spec() -> LoaderSpec {
+    LoaderSpec {
+        preprocessing: Preprocessing {
+            source: [16, 24],
+            rows: [4, 16],
+            resize: [6, 12],
+            colour: Colour::Yuv,
+            scale: 1.0 / 255.0,
+            offset: -0.5,
+            ..Default::default()
+        },
+        samples: SampleSpec { side_cameras: Some(0.25), flip: Flip::Both, ..Default::default() },
+        augmentation: Augmentation::default(),
+        batch: 32,
+        seed: 11,
+        cache: CacheSpec::default(),
+    }
+}
+
+fn augmented() -> LoaderSpec {
+    let augmentation = Augmentation {
+        brightness: Some([0.8, 1.2]),
+        shadow_probability: 0.5,
+        shift_px: 4.0,
+        shift_steering_per_px: Some(0.01),
+        ..Default::default()
+    };
+    LoaderSpec { augmentation, ..spec() }
+}
+
+fn recordings(folder: &Path, rows: usize) -> Arc<[Recording]> {
+    drive(folder, rows);
+    Arc::from([load(folder).unwrap()])
+}
+
+fn divide(recordings: &[Recording], spec: &LoaderSpec) -> Split {
+    let half = SplitSpec { mode: SplitMode::Blocks, validation_share: 0.3 };
+    split(recordings, &half, &spec.samples, &Balance::default(), spec.seed).unwrap()
+}
+
+/// Stripes that no two of the first 256 rows have nearly in common.
+fn stripe(column: usize, row: usize) -> u8 {
+    ((11 * column * column * column + 1) * 53 * row % 256) as u8
+}
+
+/// All batches of two epochs, as bits.
+fn epochs(loader: &mut Loader) -> Vec<(Vec<u32>, Vec<u32>, Vec<SampleId>)> {
+    let mut batches = Vec::new();
+    let mut batch = Batch::default();
+    for epoch in 0..2 {
+        loader.begin_epoch(epoch);
+        for i in 0..loader.batches() {
+            loader.fill(i, &mut batch).unwrap();
+            assert_eq!(batch.x.len(), batch.n * loader.spec.preprocessing.output_len());
+            let bits = |values: &[f32]| values.iter().map(|x| x.to_bits()).collect();
+            batches.push((bits(&batch.x), bits(&batch.labels), batch.samples.clone()));
+        }
+    }
+    batches
+}
+
+#[test]
+fn batches_do_not_depend_on_threads_or_cache() {
+    let folder = tempfile::tempdir().unwrap();
+    let recordings = recordings(folder.path(), 150);
+    for spec in [spec(), augmented()] {
+        let split = divide(&recordings, &spec);
+        let run = |threads: usize, memory_bytes: usize, overflow: Overflow| {
+            let cache = CacheSpec { memory_bytes, overflow, folder: None };
+            let spec = LoaderSpec { cache, ..spec.clone() };
+            let (mut training, mut validation) = Loader::pair(&recordings, &split, &spec).unwrap();
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| (epochs(&mut training), epochs(&mut validation)))
+        };
+        let expected = run(1, 1 << 30, Overflow::File);
+        for (threads, memory_bytes, overflow) in [
+            (2, 1 << 30, Overflow::File),
+            (5, 0, Overflow::File),
+            (2, 20_000, Overflow::File),
+            (5, 0, Overflow::Decode),
+        ] {
+            assert!(expected == run(threads, memory_bytes, overflow), "{threads} {memory_bytes} {overflow:?}");
+        }
+    }
+}
+
+#[test]
+fn an_epoch_shows_every_image_and_its_mirror_once() {
+    let folder = tempfile::tempdir().unwrap();
+    let recordings = recordings(folder.path(), 150);
+    let split = divide(&recordings, &spec());
+    let (mut training, mut validation) = Loader::pair(&recordings, &split, &spec()).unwrap();
+    assert_eq!(training.images(), split.training.len() * 3);
+    assert_eq!(validation.images(), split.validation.len());
+    let batches = epochs(&mut training);
+    let (first, second) = batches.split_at(training.batches());
+    let sorted = |batches: &[(Vec<u32>, Vec<u32>, Vec<SampleId>)]| {
+        let mut all: Vec<_> = batches.iter().flat_map(|b| &b.2).map(|s| (s.row, s.camera, s.mirrored)).collect();
+        all.sort_unstable();
+        all
+    };
+    assert_eq!(sorted(first).len(), training.images() * 2);
+    assert!(sorted(first).windows(2).all(|pair| pair[0] != pair[1]));
+    assert_eq!(sorted(first), sorted(second));
+    assert_ne!(first[0].2, second[0].2, "a new order in each epoch");
+    let validation = epochs(&mut validation);
+    assert!(validation.iter().all(|batch| batch.2.iter().all(|s| !s.mirrored && s.camera == View::Centre)));
+    assert!(validation[0].2.is_sorted_by_key(|sample| sample.row));
+}
+
+#[test]
+fn labels_follow_camera_and_mirror() {
+    let folder = tempfile::tempdir().unwrap();
+    let recordings = recordings(folder.path(), 150);
+    let mut spec = spec();
+    spec.preprocessing.colour = Colour::Rgb;
+    let split = divide(&recordings, &spec);
+    let loader = Loader::training(&recordings, &split, &spec).unwrap();
+    let mut batch = Batch::default();
+    let (mut mirrors, width) = (0, 12);
+    for i in 0..loader.batches() {
+        loader.fill(i, &mut batch).unwrap();
+        for (sample, (&label, x)) in batch.samples.iter().zip(batch.labels.iter().zip(batch.x.chunks_exact(3 * 6 * 12)))
+        {
+            let steering = recordings[0].rows[sample.row as usize].steering;
+            let corrected = steering + [0.0, 0.25, -0.25][sample.camera as usize];
+            assert_eq!(label, if sample.mirrored { -corrected } else { corrected });
+            // Red grows to the right in every picture, unless it is mirrored.
+            assert_eq!(x[0] > x[width - 1], sample.mirrored);
+            mirrors += usize::from(sample.mirrored);
+        }
+    }
+    assert_eq!(mirrors * 2, loader.samples());
+}
+
+#[test]
+fn rows_stay_together_where_the_recipe_says_so() {
+    let folder = tempfile::tempdir().unwrap();
+    let recordings = recordings(folder.path(), 150);
+    let mut spec = spec();
+    spec.samples.group = Group::Rows;
+    spec.batch = 25; // four rows of six samples
+    let split = divide(&recordings, &spec);
+    let loader = Loader::training(&recordings, &split, &spec).unwrap();
+    let mut batch = Batch::default();
+    assert_eq!(loader.batches(), split.training.len().div_ceil(4));
+    loader.fill(0, &mut batch).unwrap();
+    assert_eq!(batch.n, 24);
+    for row in batch.samples.chunks_exact(6) {
+        assert!(row.iter().all(|sample| sample.row == row[0].row));
+    }
+}
+
+#[test]
+fn random_mirrors_change_from_epoch_to_epoch() {
+    let folder = tempfile::tempdir().unwrap();
+    let recordings = recordings(folder.path(), 150);
+    let mut spec = spec();
+    spec.samples.flip = Flip::Random;
+    let split = divide(&recordings, &spec);
+    let mut loader = Loader::training(&recordings, &split, &spec).unwrap();
+    assert_eq!(loader.samples(), loader.images());
+    let batches = epochs(&mut loader);
+    let mirrored = |batches: &[(Vec<u32>, Vec<u32>, Vec<SampleId>)]| {
+        let all = batches.iter().flat_map(|batch| &batch.2);
+        all.filter(|sample| sample.mirrored).map(|s| (s.row, s.camera)).collect::<std::collections::BTreeSet<_>>()
+    };
+    let (first, second) = (mirrored(&batches[..loader.batches()]), mirrored(&batches[loader.batches()..]));
+    let share = first.len() as f64 / loader.images() as f64;
+    assert!((share - 0.5).abs() < 0.15, "{share}");
+    assert_ne!(first, second);
+}
+
+#[test]
+fn broken_images_are_left_out_and_counted() {
+    let folder = tempfile::tempdir().unwrap();
+    let recordings = recordings(folder.path(), 150);
+    let path = recordings[0].image_path(0, View::Left).unwrap();
+    fs::write(&path, b"\xff\xd8 no picture \xff\xd9").unwrap();
+    let none = SplitSpec { validation_share: 0.0, ..Default::default() };
+    let split = split(&recordings, &none, &spec().samples, &Balance::default(), 0).unwrap();
+    let mut loader = Loader::training(&recordings, &split, &spec()).unwrap();
+    let batches = epochs(&mut loader);
+    let samples: usize = batches.iter().map(|batch| batch.2.len()).sum();
+    assert_eq!(samples, 2 * (loader.samples() - 2));
+    let (count, examples) = loader.undecodable();
+    assert_eq!(count, 1);
+    assert!(examples[0].contains("left_2020") && examples[0].contains("JPEG"), "{examples:?}");
+}
+
+#[test]
+fn near_twins_are_found_after_an_epoch() {
+    let folder = tempfile::tempdir().unwrap();
+    let recordings = recordings(folder.path(), 150);
+    let random = SplitSpec { mode: SplitMode::Random, validation_share: 0.2 };
+    let split = split(&recordings, &random, &spec().samples, &Balance::default(), 0).unwrap();
+    let (mut training, mut validation) = Loader::pair(&recordings, &split, &spec()).unwrap();
+    assert_eq!(validation.near_twins(&training).frames, 0);
+    epochs(&mut training);
+    epochs(&mut validation);
+    let twins = validation.near_twins(&training);
+    assert_eq!(twins.frames, 30);
+    assert!(twins.share() < 0.5, "{twins:?}");
+    assert_eq!(training.near_twins(&training).share(), 1.0);
+}

@@ -1,0 +1,344 @@
+//! Training and validation rows, chosen before anything is augmented.
+//!
+//! Neighbouring frames of a drive are almost the same picture. A split by single rows therefore leaks: nearly every
+//! validation frame has a twin among the training frames, and the validation loss says little about new road. The
+//! default, `blocks`, holds out contiguous stretches of time with a guard of a second on both sides.
+
+use super::{Balance, Item, SampleSpec};
+use crate::dataset::recording::{Recording, View};
+use crate::engine::random::{Purpose, rng, shuffle, unit};
+use crate::{Error, Result};
+use serde::{Deserialize, Serialize};
+use std::ops::Range;
+
+/// Sessions of at least this length, in seconds, are cut; shorter ones go whole to one side.
+pub const LONG_SESSION_S: f64 = 60.0;
+/// Rows this near to a held-out row, in milliseconds, are used on neither side.
+pub const GUARD_MS: i64 = 1000;
+/// Shortest session, in seconds, that is cut where no validation rows could be had otherwise.
+const SHORTEST_CUT_S: f64 = 10.0;
+
+/// How validation rows are chosen.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum SplitMode {
+    /// Contiguous blocks of time: in each session of at least 60 s, one block in each of as many equal periods as
+    /// whole minutes fit, at a random place of its period.
+    #[default]
+    Blocks,
+    /// Single rows. Leaks; to reproduce the past.
+    Random,
+    /// Single images, so that even the cameras of one instant fall on both sides. Leaks; to reproduce the second
+    /// write-up.
+    RandomImages,
+}
+
+impl SplitMode {
+    /// Whether validation frames have near twins among the training frames.
+    pub fn leaks(self) -> bool {
+        self != SplitMode::Blocks
+    }
+
+    /// Name in recipes.
+    pub fn name(self) -> &'static str {
+        match self {
+            SplitMode::Blocks => "blocks",
+            SplitMode::Random => "random",
+            SplitMode::RandomImages => "random-images",
+        }
+    }
+}
+
+/// The `[split]` table of a recipe.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SplitSpec {
+    /// How validation rows are chosen.
+    pub mode: SplitMode,
+    /// Share of the rows (images with `random-images`) that is held out; 0 holds out nothing.
+    pub validation_share: f64,
+}
+
+impl Default for SplitSpec {
+    fn default() -> Self {
+        Self { mode: SplitMode::Blocks, validation_share: 0.2 }
+    }
+}
+
+impl SplitSpec {
+    /// Checks the numbers.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] naming the key.
+    pub fn validate(&self) -> Result<()> {
+        if (0.0..=0.9).contains(&self.validation_share) {
+            return Ok(());
+        }
+        Err(Error::Usage(format!("[split] validation_share: must be 0 to 0.9, found {}", self.validation_share)))
+    }
+}
+
+/// The two sides of a split, in the order of the recordings.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Split {
+    /// How it was made.
+    pub spec: SplitSpec,
+    /// Training rows.
+    pub training: Vec<Item>,
+    /// Validation rows.
+    pub validation: Vec<Item>,
+    /// Rows next to validation blocks, used on neither side.
+    pub guard_rows: usize,
+    /// Rows left out for their throttle.
+    pub low_throttle_rows: usize,
+    /// Rows left out to balance the labels.
+    pub balanced_rows: usize,
+    /// What the reader should know.
+    pub notices: Vec<String>,
+}
+
+/// Splits the usable rows of `recordings`.
+///
+/// # Errors
+/// If a table is wrong, or if one of the sides would be empty.
+pub fn split(
+    recordings: &[Recording],
+    spec: &SplitSpec,
+    samples: &SampleSpec,
+    balance: &Balance,
+    seed: u64,
+) -> Result<Split> {
+    spec.validate()?;
+    samples.validate()?;
+    balance.validate()?;
+    if recordings.len() > usize::from(u16::MAX) {
+        return Err(Error::Usage("more than 65,535 recordings".into()));
+    }
+    let mut split = Split {
+        spec: spec.clone(),
+        training: Vec::new(),
+        validation: Vec::new(),
+        guard_rows: 0,
+        low_throttle_rows: 0,
+        balanced_rows: 0,
+        notices: Vec::new(),
+    };
+    match spec.mode {
+        SplitMode::Blocks => split.by_blocks(recordings, seed),
+        SplitMode::Random => split.by_rows(recordings, samples, seed),
+        SplitMode::RandomImages => split.by_images(recordings, samples, balance, seed),
+    }
+    if spec.mode == SplitMode::Blocks {
+        split.low_throttle_rows = [&mut split.training, &mut split.validation]
+            .map(|side| drop_low_throttle(side, recordings, samples))
+            .iter()
+            .sum();
+    }
+    if spec.mode != SplitMode::RandomImages {
+        split.balanced_rows = balance.apply(&mut split.training, recordings, seed);
+        set_cameras(&mut split.training, recordings, samples.side_cameras.is_some());
+    }
+    let validate_sides = samples.side_cameras.is_some() && samples.validation_side_cameras;
+    if spec.mode != SplitMode::RandomImages {
+        set_cameras(&mut split.validation, recordings, validate_sides);
+    } else if !validate_sides {
+        split.validation.retain_mut(|item| {
+            let centre = item.cameras().any(|camera| camera == View::Centre);
+            *item = Item::new(item.recording, item.row, [View::Centre]);
+            centre
+        });
+    }
+    if spec.mode.leaks() {
+        let name = spec.mode.name();
+        split.notices.push(format!(
+            "split `{name}` leaks: validation frames have near twins among the training frames, so the validation loss \
+             is too good"
+        ));
+    }
+    split.require_both_sides()?;
+    Ok(split)
+}
+
+impl Split {
+    /// The split in words, one fact a line.
+    pub fn summary(&self) -> String {
+        let images = |side: &[Item]| side.iter().map(|item| item.cameras().count()).sum::<usize>();
+        let mut lines = vec![format!(
+            "split {}: {} training rows ({} images), {} validation rows ({} images)",
+            self.spec.mode.name(),
+            self.training.len(),
+            images(&self.training),
+            self.validation.len(),
+            images(&self.validation)
+        )];
+        for (rows, why) in [
+            (self.guard_rows, "within 1 s of a validation block, used on neither side"),
+            (self.low_throttle_rows, "left out for low throttle"),
+            (self.balanced_rows, "left out to balance the labels"),
+        ] {
+            if rows > 0 {
+                lines.push(format!("{rows} rows {why}"));
+            }
+        }
+        lines.extend(self.notices.iter().cloned());
+        lines.join("\n")
+    }
+
+    fn require_both_sides(&self) -> Result<()> {
+        if self.training.is_empty() {
+            let message = "no training rows are left: record more, or leave out less".into();
+            return Err(Error::Data { place: "the recordings".into(), message });
+        }
+        if self.validation.is_empty() && self.spec.validation_share > 0.0 {
+            let message = "no validation rows: no session is longer than 10 s. Record a longer drive, set \
+                           validation_share = 0, or use the (leaking) split mode `random`"
+                .into();
+            return Err(Error::Data { place: "the recordings".into(), message });
+        }
+        Ok(())
+    }
+
+    fn by_blocks(&mut self, recordings: &[Recording], seed: u64) {
+        let share = self.spec.validation_share;
+        let mut short = Vec::new();
+        let mut number = 0;
+        for (i, recording) in recordings.iter().enumerate() {
+            if !recording.times_plausible {
+                let path = recording.path.display();
+                self.notices.push(format!("{path}: blocks of time are counted at 20 Hz, time stamps are implausible"));
+            }
+            for session in &recording.sessions {
+                number += 1;
+                if recording.session_s(session) >= LONG_SESSION_S {
+                    self.cut(recording, i as u16, session, seed, number);
+                } else {
+                    short.push((i as u16, session.clone(), number));
+                }
+            }
+        }
+        // Short sessions go whole to one side, in random order, as long as validation keeps to its share of them.
+        let rows: usize = short.iter().map(|(_, session, _)| session.len()).sum();
+        let mut room = (share * rows as f64).round() as usize;
+        shuffle(&mut rng(seed, Purpose::Split, 0, 0), &mut short);
+        let mut kept = Vec::new();
+        for (i, session, number) in short {
+            if session.len() <= room {
+                room -= session.len();
+                self.validation.extend(rows_of(i, session));
+            } else {
+                kept.push((i, session, number));
+            }
+        }
+        let nothing_held_out = self.validation.is_empty() && share > 0.0;
+        if nothing_held_out {
+            self.notices.push(
+                "no session is 60 s long and none is short enough to be held out whole: \
+                 those of at least 10 s are cut, with a guard"
+                    .into(),
+            );
+        }
+        for (i, session, number) in kept {
+            let recording = &recordings[usize::from(i)];
+            if nothing_held_out && recording.session_s(&session) >= SHORTEST_CUT_S {
+                self.cut(recording, i, &session, seed, number);
+            } else {
+                self.training.extend(rows_of(i, session));
+            }
+        }
+        self.training.sort_unstable();
+        self.validation.sort_unstable();
+    }
+
+    /// Cuts validation blocks out of a session.
+    fn cut(&mut self, recording: &Recording, i: u16, session: &Range<usize>, seed: u64, number: u64) {
+        let share = self.spec.validation_share;
+        let start_ms = recording.rows[session.start].time_ms;
+        let periods = (recording.session_s(session) / LONG_SESSION_S).floor().max(1.0);
+        let period_ms = recording.session_s(session) * 1000.0 / periods;
+        let mut rng = rng(seed, Purpose::Split, 0, number);
+        let blocks: Vec<Range<i64>> = (0..periods as usize)
+            .filter(|_| share > 0.0)
+            .map(|period| {
+                let begin = (period as f64 + unit(&mut rng) * (1.0 - share)) * period_ms;
+                start_ms + begin as i64..start_ms + (begin + share * period_ms) as i64
+            })
+            .collect();
+        for row in session.clone() {
+            let time_ms = recording.rows[row].time_ms;
+            let item = rows_of(i, row..row + 1);
+            if blocks.iter().any(|block| block.contains(&time_ms)) {
+                self.validation.extend(item);
+            } else if blocks.iter().any(|b| (b.start - GUARD_MS..b.end + GUARD_MS).contains(&time_ms)) {
+                self.guard_rows += 1;
+            } else {
+                self.training.extend(item);
+            }
+        }
+    }
+
+    fn by_rows(&mut self, recordings: &[Recording], samples: &SampleSpec, seed: u64) {
+        let mut rows = all_rows(recordings);
+        self.low_throttle_rows = drop_low_throttle(&mut rows, recordings, samples);
+        shuffle(&mut rng(seed, Purpose::Split, 0, 0), &mut rows);
+        self.training = rows.split_off((self.spec.validation_share * rows.len() as f64).round() as usize);
+        self.validation = rows;
+        self.training.sort_unstable();
+        self.validation.sort_unstable();
+    }
+
+    fn by_images(&mut self, recordings: &[Recording], samples: &SampleSpec, balance: &Balance, seed: u64) {
+        let mut rows = all_rows(recordings);
+        self.low_throttle_rows = drop_low_throttle(&mut rows, recordings, samples);
+        self.balanced_rows = balance.apply(&mut rows, recordings, seed);
+        set_cameras(&mut rows, recordings, samples.side_cameras.is_some());
+        let mut images: Vec<Item> = rows
+            .iter()
+            .flat_map(|&item| item.cameras().map(move |camera| Item::new(item.recording, item.row, [camera])))
+            .collect();
+        shuffle(&mut rng(seed, Purpose::Split, 0, 0), &mut images);
+        let training = images.split_off((self.spec.validation_share * images.len() as f64).round() as usize);
+        self.training = rows_of_images(training);
+        self.validation = rows_of_images(images);
+    }
+}
+
+/// Puts the cameras of a row that lie on the same side together again.
+fn rows_of_images(mut images: Vec<Item>) -> Vec<Item> {
+    images.sort_unstable();
+    images
+        .chunk_by(|a, b| (a.recording, a.row) == (b.recording, b.row))
+        .map(|row| Item::new(row[0].recording, row[0].row, row.iter().flat_map(|item| item.cameras())))
+        .collect()
+}
+
+fn rows_of(recording: u16, rows: Range<usize>) -> impl Iterator<Item = Item> {
+    rows.map(move |row| Item::new(recording, row as u32, [View::Centre]))
+}
+
+fn all_rows(recordings: &[Recording]) -> Vec<Item> {
+    recordings.iter().enumerate().flat_map(|(i, recording)| rows_of(i as u16, 0..recording.rows.len())).collect()
+}
+
+fn drop_low_throttle(items: &mut Vec<Item>, recordings: &[Recording], samples: &SampleSpec) -> usize {
+    let before = items.len();
+    if let Some(min) = samples.min_throttle {
+        // Where the throttle was not recorded it is NaN, and the row stays.
+        items.retain(|item| {
+            let throttle = f64::from(recordings[usize::from(item.recording)].rows[item.row as usize].throttle);
+            throttle.is_nan() || throttle > min
+        });
+    }
+    before - items.len()
+}
+
+fn set_cameras(items: &mut [Item], recordings: &[Recording], sides: bool) {
+    for item in items {
+        let recording = &recordings[usize::from(item.recording)];
+        let used = |camera: &View| *camera == View::Centre || (sides && recording.row_has(item.row as usize, *camera));
+        *item = Item::new(item.recording, item.row, View::ALL.into_iter().filter(used));
+    }
+}
+
+#[cfg(test)]
+#[path = "split_tests.rs"]
+mod tests;

@@ -1,0 +1,174 @@
+//! Decoding of JPEG and PNG images to 8-bit RGB.
+
+use std::io::Cursor;
+use zune_jpeg::JpegDecoder;
+use zune_jpeg::zune_core::bytestream::ZCursor;
+use zune_jpeg::zune_core::colorspace::ColorSpace;
+use zune_jpeg::zune_core::options::DecoderOptions;
+
+use super::RgbImage;
+
+/// Largest height or width that is decoded, in pixels.
+pub const MAX_SIDE: usize = 8192;
+
+/// First bytes of every PNG file.
+const PNG_SIGNATURE: &[u8] = b"\x89PNG\r\n\x1a\n";
+
+/// Decodes a JPEG or PNG file held in `bytes` into `image`.
+///
+/// A JPEG that ends before its end marker is an error, not a picture with a grey bottom.
+///
+/// # Errors
+/// A short sentence that says what is wrong with the image; the caller knows its place.
+pub fn decode_rgb(bytes: &[u8], image: &mut RgbImage) -> Result<(), String> {
+    decode_rgb_within(bytes, MAX_SIDE, image)
+}
+
+/// [`decode_rgb`] for images of strangers: what is higher or wider than `max_side` pixels is not decoded.
+///
+/// # Errors
+/// As [`decode_rgb`].
+pub fn decode_rgb_within(bytes: &[u8], max_side: usize, image: &mut RgbImage) -> Result<(), String> {
+    if bytes.is_empty() {
+        Err("the image is empty".into())
+    } else if bytes.starts_with(PNG_SIGNATURE) {
+        decode_png(bytes, max_side, image)
+    } else if bytes.starts_with(&[0xff, 0xd8]) {
+        if !ends_complete(bytes) {
+            return Err("the JPEG is truncated".into());
+        }
+        decode_jpeg(bytes, max_side, image)
+    } else {
+        Err("neither a JPEG nor a PNG image".into())
+    }
+}
+
+/// Height and width of a JPEG or PNG image, from its header alone.
+///
+/// # Errors
+/// As [`decode_rgb`].
+pub fn image_size(bytes: &[u8]) -> Result<[usize; 2], String> {
+    let reader = image::ImageReader::new(Cursor::new(bytes)).with_guessed_format().map_err(|e| e.to_string())?;
+    let (width, height) = reader.into_dimensions().map_err(|e| e.to_string())?;
+    Ok([height as usize, width as usize])
+}
+
+/// Whether the last bytes of an image file hold the end marker of a JPEG or the last chunk of a PNG.
+///
+/// Some cameras pad the file, so the marker may stand a little before the end.
+pub fn ends_complete(tail: &[u8]) -> bool {
+    let tail = &tail[tail.len().saturating_sub(64)..];
+    let ends_with = |marker: &[u8]| tail.windows(marker.len()).any(|window| window == marker);
+    ends_with(&[0xff, 0xd9]) || ends_with(b"IEND")
+}
+
+/// Whether the first bytes of a file are those of a JPEG or PNG image.
+pub fn starts_as_image(head: &[u8]) -> bool {
+    head.starts_with(&[0xff, 0xd8]) || head.starts_with(PNG_SIGNATURE)
+}
+
+fn decode_jpeg(bytes: &[u8], max_side: usize, image: &mut RgbImage) -> Result<(), String> {
+    let options = DecoderOptions::default()
+        .jpeg_set_out_colorspace(ColorSpace::RGB)
+        .set_max_width(max_side)
+        .set_max_height(max_side);
+    let mut decoder = JpegDecoder::new_with_options(ZCursor::new(bytes), options);
+    let failed = |error: zune_jpeg::errors::DecodeErrors| format!("the JPEG cannot be decoded: {error:?}");
+    decoder.decode_headers().map_err(failed)?;
+    let (width, height) = decoder.dimensions().ok_or("the JPEG has no size")?;
+    image.pixels.resize(width * height * 3, 0);
+    if decoder.output_buffer_size() != Some(image.pixels.len()) {
+        return Err("the JPEG has colours that cannot be turned into RGB".into());
+    }
+    decoder.decode_into(&mut image.pixels).map_err(failed)?;
+    (image.height, image.width) = (height, width);
+    Ok(())
+}
+
+fn decode_png(bytes: &[u8], max_side: usize, image: &mut RgbImage) -> Result<(), String> {
+    let mut reader = image::ImageReader::with_format(Cursor::new(bytes), image::ImageFormat::Png);
+    let mut limits = image::Limits::default();
+    limits.max_image_width = Some(max_side as u32);
+    limits.max_image_height = Some(max_side as u32);
+    reader.limits(limits);
+    let decoded = reader.decode().map_err(|error| format!("the PNG cannot be decoded: {error}"))?.into_rgb8();
+    (image.height, image.width) = (decoded.height() as usize, decoded.width() as usize);
+    image.pixels.clear();
+    image.pixels.extend_from_slice(decoded.as_raw());
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use image::ImageEncoder;
+
+    fn gradient(width: usize, height: usize) -> Vec<u8> {
+        (0..height).flat_map(|y| (0..width).flat_map(move |x| [(x * 3) as u8, (y * 5) as u8, 90])).collect()
+    }
+
+    fn jpeg(pixels: &[u8], width: u16, height: u16) -> Vec<u8> {
+        let mut bytes = Vec::new();
+        jpeg_encoder::Encoder::new(&mut bytes, 95).encode(pixels, width, height, jpeg_encoder::ColorType::Rgb).unwrap();
+        bytes
+    }
+
+    #[test]
+    fn jpeg_and_png_decode_to_the_same_picture() {
+        let pixels = gradient(40, 24);
+        let mut png = Vec::new();
+        image::codecs::png::PngEncoder::new(&mut png)
+            .write_image(&pixels, 40, 24, image::ExtendedColorType::Rgb8)
+            .unwrap();
+        let mut image = RgbImage::default();
+        decode_rgb(&png, &mut image).unwrap();
+        assert_eq!((image.height, image.width, &image.pixels), (24, 40, &pixels));
+        let jpeg = jpeg(&pixels, 40, 24);
+        decode_rgb(&jpeg, &mut image).unwrap();
+        assert_eq!((image.height, image.width), (24, 40));
+        let error: f64 = image.pixels.iter().zip(&pixels).map(|(a, b)| f64::from(a.abs_diff(*b))).sum();
+        assert!(error / (pixels.len() as f64) < 3.0, "mean error {}", error / pixels.len() as f64);
+        assert_eq!(image_size(&jpeg), Ok([24, 40]));
+        assert_eq!(image_size(&png), Ok([24, 40]));
+    }
+
+    #[test]
+    fn too_large_an_image_is_not_decoded() {
+        let mut image = RgbImage::default();
+        let jpeg = jpeg(&gradient(40, 24), 40, 24);
+        assert!(decode_rgb_within(&jpeg, 40, &mut image).is_ok());
+        assert!(decode_rgb_within(&jpeg, 39, &mut image).is_err());
+        let mut png = Vec::new();
+        let encoder = image::codecs::png::PngEncoder::new(&mut png);
+        encoder.write_image(&gradient(24, 40), 24, 40, image::ExtendedColorType::Rgb8).unwrap();
+        assert!(decode_rgb_within(&png, 40, &mut image).is_ok());
+        assert!(decode_rgb_within(&png, 39, &mut image).is_err());
+    }
+
+    #[test]
+    fn a_grey_jpeg_becomes_rgb() {
+        let mut bytes = Vec::new();
+        jpeg_encoder::Encoder::new(&mut bytes, 95).encode(&[80; 64], 8, 8, jpeg_encoder::ColorType::Luma).unwrap();
+        let mut image = RgbImage::default();
+        decode_rgb(&bytes, &mut image).unwrap();
+        assert!(image.pixels.len() == 192 && image.pixels.iter().all(|&x| x.abs_diff(80) <= 2));
+    }
+
+    #[test]
+    fn broken_images_are_errors() {
+        let whole = jpeg(&gradient(40, 24), 40, 24);
+        let mut image = RgbImage::default();
+        for length in [0, 1, 2, 20, whole.len() / 2, whole.len() - 2] {
+            assert!(decode_rgb(&whole[..length], &mut image).is_err(), "{length} bytes of {}", whole.len());
+        }
+        assert!(decode_rgb(b"GIF89a and so on", &mut image).is_err());
+        assert!(decode_rgb(PNG_SIGNATURE, &mut image).is_err());
+    }
+
+    #[test]
+    fn padding_after_the_end_marker_is_no_truncation() {
+        let mut bytes = jpeg(&gradient(16, 16), 16, 16);
+        bytes.extend([0; 10]);
+        assert!(decode_rgb(&bytes, &mut RgbImage::default()).is_ok());
+    }
+}

@@ -1,0 +1,392 @@
+//! Charts: axes with units, a legend, lines, steps, dots and bars.
+
+use crate::report::charts::palette::{GRID, INK, QUIET_INK};
+use crate::report::charts::svg::{Anchor, Svg, text_width};
+
+/// Size of the labels of the ticks, pixels.
+const TICK_SIZE: f64 = 12.0;
+/// Size of axis labels and legend, pixels.
+const LABEL_SIZE: f64 = 13.0;
+/// Room left of the axes.
+const LEFT: f64 = 64.0;
+/// Room right of the axes.
+const RIGHT: f64 = 18.0;
+/// Room below the axes.
+const BELOW: f64 = 44.0;
+
+/// How an axis maps values to places.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Scale {
+    /// Evenly.
+    Linear,
+    /// By the logarithm; values that are not positive are left out.
+    Log,
+}
+
+/// One of the two axes.
+#[derive(Clone, Debug)]
+pub struct Axis {
+    label: String,
+    scale: Scale,
+    range: Option<[f64; 2]>,
+}
+
+impl Axis {
+    /// An axis called `label`, unit included, that covers the data.
+    pub fn new(label: impl Into<String>) -> Axis {
+        Axis { label: label.into(), scale: Scale::Linear, range: None }
+    }
+
+    /// With a logarithmic scale.
+    pub fn log(self) -> Axis {
+        Axis { scale: Scale::Log, ..self }
+    }
+
+    /// From `low` to `high`, whatever the data; what lies beyond is drawn at the border.
+    pub fn range(self, low: f64, high: f64) -> Axis {
+        Axis { range: Some([low, high]), ..self }
+    }
+}
+
+/// How the values of a series are drawn.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Mark {
+    /// A line of this width in pixels.
+    Line(f64),
+    /// A dashed line.
+    Dashed,
+    /// Dots of this diameter in pixels.
+    Dots(f64),
+    /// A bar from zero, as wide as the distance to its neighbours; on a logarithmic axis from the bottom.
+    Bars {
+        /// Width of a bar in units of x.
+        width: f64,
+    },
+}
+
+#[derive(Clone, Debug)]
+struct Series {
+    name: String,
+    colour: String,
+    mark: Mark,
+    points: Vec<[f64; 2]>,
+}
+
+/// A chart to be drawn.
+#[derive(Clone, Debug)]
+pub struct Chart {
+    title: String,
+    size: [f64; 2],
+    x: Axis,
+    y: Axis,
+    series: Vec<Series>,
+    shaded: Vec<([f64; 2], String)>,
+}
+
+impl Chart {
+    /// An empty chart of `size` (width, height) pixels.
+    pub fn new(title: impl Into<String>, size: [f64; 2], x: Axis, y: Axis) -> Chart {
+        Chart { title: title.into(), size, x, y, series: Vec::new(), shaded: Vec::new() }
+    }
+
+    /// Adds values. An empty name leaves the series out of the legend. Of long lines only the extremes of each column of
+    /// pixels are drawn.
+    pub fn add(mut self, name: &str, colour: &str, mark: Mark, points: Vec<[f64; 2]>) -> Chart {
+        let points = match mark {
+            Mark::Line(_) | Mark::Dashed => thin_out(points, self.size[0] as usize),
+            _ => points,
+        };
+        self.series.push(Series { name: name.into(), colour: colour.into(), mark, points });
+        self
+    }
+
+    /// Shades a range of x in `colour`.
+    pub fn shade(mut self, from: f64, to: f64, colour: &str) -> Chart {
+        self.shaded.push(([from, to], colour.into()));
+        self
+    }
+
+    /// The drawing.
+    pub fn draw(&self) -> String {
+        let mut svg = Svg::new(self.size[0], self.size[1]);
+        self.draw_into(&mut svg);
+        svg.finish()
+    }
+
+    fn draw_into(&self, svg: &mut Svg) {
+        let [width, height] = self.size;
+        svg.text([LEFT, 20.0], 15.0, Anchor::Start, "font-weight=\"600\"", &self.title);
+        svg.text([8.0, 42.0], LABEL_SIZE, Anchor::Start, &fill(QUIET_INK), &self.y.label);
+        let above = self.legend(svg);
+        let area = Area { left: LEFT, right: width - RIGHT, top: above, bottom: height - BELOW };
+        let bars = self.series.iter().any(|series| matches!(series.mark, Mark::Bars { .. }));
+        let margin = |series: &Series| if let Mark::Bars { width } = series.mark { width / 2.0 } else { 0.0 };
+        let xs = self.series.iter().flat_map(|s| {
+            let margin = margin(s);
+            s.points.iter().flat_map(move |p| [p[0] - margin, p[0] + margin])
+        });
+        let ys = self.series.iter().flat_map(|s| s.points.iter().map(|p| p[1])).chain(bars.then_some(0.0));
+        let x = Map::new(&self.x, xs, [area.left, area.right], false);
+        let y = Map::new(&self.y, ys, [area.bottom, area.top], true);
+
+        for ([from, to], colour) in &self.shaded {
+            let (left, right) = (x.place(*from), x.place(*to));
+            svg.rect([left, area.top], [(right - left).max(1.0), area.bottom - area.top], &fill(colour));
+        }
+        let grid = format!("stroke=\"{GRID}\" stroke-width=\"1\"");
+        for (value, label) in y.ticks((area.bottom - area.top) / 40.0) {
+            let at = y.place(value);
+            svg.line([area.left, at], [area.right, at], &grid);
+            svg.text([area.left - 7.0, at + 4.0], TICK_SIZE, Anchor::End, "", &label);
+        }
+        let ticks = x.ticks((area.right - area.left) / 80.0);
+        for (value, label) in &ticks {
+            let at = x.place(*value);
+            svg.line([at, area.bottom], [at, area.bottom + 5.0], &stroke(INK, 1.0));
+            svg.text([at, area.bottom + 18.0], TICK_SIZE, Anchor::Middle, "", label);
+        }
+        svg.line([area.left, area.bottom], [area.right, area.bottom], &stroke(INK, 1.0));
+        if y.low < 0.0 && y.high > 0.0 {
+            svg.line([area.left, y.place(0.0)], [area.right, y.place(0.0)], &stroke(INK, 1.0));
+        }
+        let middle = (area.left + area.right) / 2.0;
+        svg.text([middle, height - 8.0], LABEL_SIZE, Anchor::Middle, &fill(QUIET_INK), &self.x.label);
+
+        for series in &self.series {
+            let points = series.points.iter().map(|p| [x.place(p[0]), y.place(p[1])]);
+            match series.mark {
+                Mark::Line(width) => {
+                    let points: Vec<_> = points.collect();
+                    svg.polyline(&points, &stroke(&series.colour, width));
+                    if points.len() < 40 {
+                        svg.dots(points, width + 4.0, &series.colour, 1.0);
+                    }
+                }
+                Mark::Dashed => {
+                    let style = format!("{} stroke-dasharray=\"6 4\"", stroke(&series.colour, 1.5));
+                    svg.polyline(&points.collect::<Vec<_>>(), &style);
+                }
+                Mark::Dots(diameter) => svg.dots(points, diameter, &series.colour, 0.45),
+                Mark::Bars { width } => {
+                    let bottom = if y.scale == Scale::Log { area.bottom } else { y.place(0.0) };
+                    for point in series.points.iter().filter(|p| p[1].is_finite() && p[1] != 0.0) {
+                        let (left, right) = (x.place(point[0] - width / 2.0), x.place(point[0] + width / 2.0));
+                        let top = y.place(point[1]);
+                        // A hairline between neighbours; none that is there is too small to be seen.
+                        let high = (bottom - top).abs().max(1.0);
+                        let size = [(right - left - 1.0).max(1.0), high];
+                        svg.rect([left + 0.5, bottom.min(top).min(bottom - 1.0)], size, &fill(&series.colour));
+                    }
+                }
+            }
+        }
+    }
+
+    /// Draws the legend, in as many lines as it needs, and returns where the axes may begin.
+    fn legend(&self, svg: &mut Svg) -> f64 {
+        let named: Vec<&Series> = self.series.iter().filter(|series| !series.name.is_empty()).collect();
+        let from = LEFT.max(text_width(&self.y.label, LABEL_SIZE) + 30.0);
+        let (mut x, mut y) = (from, 42.0);
+        for series in named {
+            let width = 30.0 + text_width(&series.name, LABEL_SIZE) + 14.0;
+            if x > from && x + width > self.size[0] {
+                (x, y) = (from, y + 19.0);
+            }
+            match series.mark {
+                Mark::Line(_) => svg.line([x, y - 4.5], [x + 22.0, y - 4.5], &stroke(&series.colour, 3.0)),
+                Mark::Dashed => {
+                    let style = format!("{} stroke-dasharray=\"6 4\"", stroke(&series.colour, 2.0));
+                    svg.line([x, y - 4.5], [x + 22.0, y - 4.5], &style);
+                }
+                Mark::Dots(_) => svg.dots([[x + 12.0, y - 4.5]], 8.0, &series.colour, 1.0),
+                Mark::Bars { .. } => svg.rect([x + 5.0, y - 11.0], [14.0, 12.0], &fill(&series.colour)),
+            }
+            svg.text([x + 28.0, y], LABEL_SIZE, Anchor::Start, "", &series.name);
+            x += width;
+        }
+        y + 14.0
+    }
+}
+
+struct Area {
+    left: f64,
+    right: f64,
+    top: f64,
+    bottom: f64,
+}
+
+/// `fill="colour"`.
+pub(super) fn fill(colour: &str) -> String {
+    format!("fill=\"{colour}\"")
+}
+
+/// `stroke="colour" stroke-width="width"`.
+pub(super) fn stroke(colour: &str, width: f64) -> String {
+    format!("stroke=\"{colour}\" stroke-width=\"{width}\"")
+}
+
+/// From values to pixels.
+struct Map {
+    scale: Scale,
+    low: f64,
+    high: f64,
+    pixels: [f64; 2],
+}
+
+impl Map {
+    /// Covers `values`; with `round`, to the next ticks.
+    fn new(axis: &Axis, values: impl Iterator<Item = f64>, pixels: [f64; 2], round: bool) -> Map {
+        let positive = axis.scale == Scale::Log;
+        let [mut low, mut high] = axis.range.unwrap_or_else(|| {
+            values
+                .filter(|v| v.is_finite() && (!positive || *v > 0.0))
+                .fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], v| [low.min(v), high.max(v)])
+        });
+        if low > high {
+            (low, high) = if positive { (0.1, 1.0) } else { (0.0, 1.0) };
+        }
+        if positive {
+            // A logarithmic axis of less than a factor of 2 says nothing.
+            if high / low < 2.0 {
+                let middle = (low * high).sqrt();
+                (low, high) = (middle / 1.5, middle * 1.5);
+            }
+            let spread = if axis.range.is_none() { (high / low).powf(0.05) } else { 1.0 };
+            (low, high) = (low / spread, high * spread);
+        } else {
+            if high - low < 1e-12 * low.abs().max(1e-6) {
+                let half = (0.1 * low.abs()).max(0.5);
+                (low, high) = (low - half, high + half);
+            }
+            if round && axis.range.is_none() {
+                let step = step((high - low) / 5.0);
+                (low, high) = ((low / step).floor() * step, (high / step).ceil() * step);
+            }
+        }
+        Map { scale: axis.scale, low, high, pixels }
+    }
+
+    /// Where `value` lies; values beyond the range at its border. Not a number where there is no place.
+    fn place(&self, value: f64) -> f64 {
+        let share = match self.scale {
+            Scale::Linear => (value - self.low) / (self.high - self.low),
+            Scale::Log if value <= 0.0 => f64::NAN,
+            Scale::Log => (value / self.low).ln() / (self.high / self.low).ln(),
+        };
+        let share = if share.is_nan() { share } else { share.clamp(0.0, 1.0) };
+        self.pixels[0] + share * (self.pixels[1] - self.pixels[0])
+    }
+
+    /// About `count` round values with their labels.
+    fn ticks(&self, count: f64) -> Vec<(f64, String)> {
+        match self.scale {
+            Scale::Linear => {
+                let step = step((self.high - self.low) / count.max(1.0));
+                let decimals = (-(step.log10() + 1e-9).floor()).max(0.0) as usize;
+                let first = (self.low / step - 1e-9).ceil() as i64;
+                let last = (self.high / step + 1e-9).floor() as i64;
+                let label = |value: f64| match value.abs() {
+                    v if v >= 1e6 || (v > 0.0 && v < 1e-4) => format!("{value:e}"),
+                    _ => format!("{value:.decimals$}"),
+                };
+                (first..=last).map(|i| i as f64 * step).map(|value| (value, label(value))).collect()
+            }
+            Scale::Log => {
+                let (first, last) = (self.low.log10().floor() as i32, self.high.log10().ceil() as i32);
+                let decades = f64::from(last - first);
+                let steps: &[f64] = if decades <= 3.0 { &[1.0, 2.0, 5.0] } else { &[1.0] };
+                let values = (first..=last).flat_map(|power| steps.iter().map(move |s| s * 10f64.powi(power)));
+                let inside = values.filter(|v| (self.low * 0.999..=self.high * 1.001).contains(v));
+                let label = |v: f64| match v {
+                    v if !(1e-4..1e5).contains(&v) => format!("{v:.0e}"),
+                    v if v >= 1.0 => format!("{v:.0}"),
+                    v => format!("{v:.*}", (-v.log10() - 1e-9).ceil() as usize),
+                };
+                inside.map(|v| (v, label(v))).collect()
+            }
+        }
+    }
+}
+
+/// The next of 1, 2, 5, 10, … from `rough` on.
+fn step(rough: f64) -> f64 {
+    let power = 10f64.powf(rough.max(1e-300).log10().floor());
+    let digit = rough / power;
+    power * [1.0, 2.0, 5.0].into_iter().find(|d| digit <= d + 1e-9).unwrap_or(10.0)
+}
+
+/// Of a long line, the lowest and the highest point in each of `columns` runs of points; gaps stay.
+fn thin_out(points: Vec<[f64; 2]>, columns: usize) -> Vec<[f64; 2]> {
+    if points.len() <= 4 * columns {
+        return points;
+    }
+    let run = points.len().div_ceil(columns);
+    let mut kept = Vec::with_capacity(3 * columns);
+    for chunk in points.chunks(run) {
+        let finite = || chunk.iter().enumerate().filter(|(_, p)| p[1].is_finite());
+        let low = finite().min_by(|a, b| a.1[1].total_cmp(&b.1[1])).map(|(i, _)| i);
+        let high = finite().max_by(|a, b| a.1[1].total_cmp(&b.1[1])).map(|(i, _)| i);
+        let gap = chunk.iter().position(|p| !p[1].is_finite());
+        let mut chosen: Vec<usize> = [low, high, gap].into_iter().flatten().collect();
+        chosen.sort_unstable();
+        chosen.dedup();
+        kept.extend(chosen.into_iter().map(|i| chunk[i]));
+    }
+    kept
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn labels(low: f64, high: f64, scale: Scale, count: f64) -> Vec<String> {
+        let map = Map { scale, low, high, pixels: [0.0, 100.0] };
+        map.ticks(count).into_iter().map(|(_, label)| label).collect()
+    }
+
+    #[test]
+    fn ticks_are_round_numbers_with_just_enough_decimals() {
+        assert_eq!(labels(-1.0, 1.0, Scale::Linear, 5.0), ["-1.0", "-0.5", "0.0", "0.5", "1.0"]);
+        assert_eq!(labels(0.0, 30.0, Scale::Linear, 3.0), ["0", "10", "20", "30"]);
+        assert_eq!(labels(0.011, 0.3, Scale::Log, 5.0), ["0.02", "0.05", "0.1", "0.2"]);
+        assert_eq!(labels(1e-5, 0.02, Scale::Log, 5.0), ["1e-5", "0.0001", "0.001", "0.01"]);
+    }
+
+    #[test]
+    fn values_lie_where_the_axis_says() {
+        let axis = Axis::new("x");
+        let map = Map::new(&axis, [0.0, 10.0].into_iter(), [100.0, 200.0], false);
+        assert_eq!([0.0, 5.0, 10.0, 99.0].map(|v| map.place(v)), [100.0, 150.0, 200.0, 200.0]);
+        let log = Map::new(&axis.log().range(0.01, 1.0), [].into_iter(), [0.0, 100.0], true);
+        assert!((log.place(0.1) - 50.0).abs() < 1e-9 && log.place(0.0).is_nan());
+        let rounded = Map::new(&Axis::new("y"), [0.3, 9.4].into_iter(), [0.0, 1.0], true);
+        assert_eq!((rounded.low, rounded.high), (0.0, 10.0));
+    }
+
+    #[test]
+    fn charts_of_nothing_of_one_value_and_of_missing_values_are_drawn() {
+        for points in [vec![], vec![[1.0, 3.0]], vec![[0.0, f64::NAN]], vec![[0.0, 1.0], [1.0, f64::INFINITY]]] {
+            for scale in [Scale::Linear, Scale::Log] {
+                let axis = Axis { scale, ..Axis::new("loss") };
+                let chart = Chart::new("t", [400.0, 300.0], Axis::new("epoch"), axis)
+                    .add("line", "#000000", Mark::Line(2.0), points.clone())
+                    .add("bars", "#ff0000", Mark::Bars { width: 0.5 }, points.clone());
+                let text = chart.draw();
+                assert!(roxmltree::Document::parse(&text).is_ok() && !text.contains("NaN") && !text.contains("inf"));
+            }
+        }
+    }
+
+    #[test]
+    fn a_thinned_line_keeps_its_extremes_and_gaps() {
+        let mut points: Vec<[f64; 2]> = (0..10_000).map(|i| [f64::from(i), 0.5]).collect();
+        (points[1234][1], points[7000][1], points[9000][1]) = (9.0, -9.0, f64::NAN);
+        let thin = thin_out(points, 100);
+        assert!(thin.len() <= 300);
+        for wanted in [9.0, -9.0] {
+            assert!(thin.iter().any(|p| p[1] == wanted));
+        }
+        assert!(thin.iter().any(|p| p[1].is_nan()));
+        assert!(thin.windows(2).all(|w| w[0][0] < w[1][0]));
+    }
+}

@@ -1,0 +1,6 @@
+//! What a model looks at: [`saliency`] shows what excites its layers, [`counterfactual`] measures what its angle depends on.
+
+pub mod counterfactual;
+pub mod exhibits;
+pub mod footage;
+pub mod saliency;

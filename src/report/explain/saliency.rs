@@ -1,0 +1,370 @@
+//! Which parts of the picture excite the network: VisualBackProp (Bojarski et al. 2016, arXiv 1611.05418), the method of
+//! NVIDIA's "Explaining How a Deep Neural Network Trained with End-to-End Learning Steers a Car" (2017, arXiv 1704.07911).
+//!
+//! The feature maps of each convolution, after its activation, are averaged over the channels; what is negative counts as 0.
+//! From the last map down, each is spread to the size of the layer below by a transposed convolution with the kernel size,
+//! stride and padding of the layer between (weights 1, no bias; pooling likewise) and multiplied with the map there. The map
+//! that arrives at the input is scaled to [0, 1].
+//!
+//! It shows what *excites* the layers, not what the steering depends on: that is what [`crate::report::explain::counterfactual`] measures.
+
+use crate::dataset::preprocess::Preprocessing;
+use crate::engine::network::{LayerSpec, Network};
+use crate::error::{Error, Result};
+use crate::picture::RgbImage;
+use crate::pilot::Pilot;
+
+/// Largest share of the overlay's colour.
+const OPACITY: f32 = 0.85;
+
+/// Saliency of one picture after the other. All buffers are planned once: a picture allocates nothing.
+#[derive(Clone, Debug)]
+pub struct Saliency {
+    steps: Vec<Step>,
+    means: Vec<Mean>,
+    /// Height and width of the network's input.
+    size: [usize; 2],
+    map: Vec<f32>,
+    spread: Vec<f32>,
+    half_spread: Vec<f32>,
+}
+
+/// A layer's feature maps, averaged.
+#[derive(Clone, Debug)]
+struct Mean {
+    layer: usize,
+    channels: usize,
+    values: Vec<f32>,
+}
+
+/// What is done on the way from the last map to the input, in the order of the layers; gone through backwards.
+#[derive(Clone, Copy, Debug)]
+enum Step {
+    /// Through a layer that changes the size.
+    Spread([Axis; 2]),
+    /// Multiply with this mean.
+    Multiply(usize),
+}
+
+/// How a layer's output relates to its input along one axis: output `i` covers inputs `i * stride - before` and the `kernel`
+/// from there on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Axis {
+    /// Inputs.
+    pub from: usize,
+    /// Outputs.
+    pub to: usize,
+    /// Inputs that an output covers.
+    pub kernel: usize,
+    /// Distance of neighbouring outputs, in inputs.
+    pub stride: usize,
+    /// Inputs before the first that the first output covers: padding if positive, what was cut off if negative.
+    pub before: isize,
+}
+
+impl Saliency {
+    /// Plans the saliency of `network`.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Usage`] if the network has no convolution.
+    pub fn new(network: &Network) -> Result<Saliency> {
+        let (mut steps, mut means) = (Vec::new(), Vec::<Mean>::new());
+        let mut after_convolution = false;
+        for (index, named) in network.layers().iter().enumerate() {
+            let (input, output) = (named.layer.input(), named.layer.output());
+            let axes = |kernel: [usize; 2], stride: [usize; 2], before: [isize; 2]| {
+                let axis =
+                    |k: usize, from, to| Axis { from, to, kernel: kernel[k], stride: stride[k], before: before[k] };
+                Step::Spread([axis(0, input.h, output.h), axis(1, input.w, output.w)])
+            };
+            match named.spec {
+                LayerSpec::Conv2d { kernel, stride, padding, .. } => {
+                    let before = |k: usize, size| padding.amounts(size, kernel[k], stride[k]).0 as isize;
+                    steps.push(axes(kernel, stride, [before(0, input.h), before(1, input.w)]));
+                    means.push(Mean { layer: index, channels: output.c, values: vec![0.0; output.positions()] });
+                    steps.push(Step::Multiply(means.len() - 1));
+                    after_convolution = true;
+                }
+                LayerSpec::MaxPool { window, stride } | LayerSpec::AveragePool { window, stride } => {
+                    steps.push(axes(window, stride.unwrap_or(window), [0, 0]));
+                    after_convolution = false;
+                }
+                LayerSpec::Crop { rows, columns } => {
+                    steps.push(axes([1, 1], [1, 1], [-(rows[0] as isize), -(columns[0] as isize)]));
+                    after_convolution = false;
+                }
+                LayerSpec::ZeroPad { rows, columns } => {
+                    steps.push(axes([1, 1], [1, 1], [rows[0] as isize, columns[0] as isize]));
+                    after_convolution = false;
+                }
+                LayerSpec::BatchNorm { .. }
+                | LayerSpec::Relu {}
+                | LayerSpec::LeakyRelu { .. }
+                | LayerSpec::Elu { .. }
+                | LayerSpec::PRelu { .. }
+                | LayerSpec::Tanh {}
+                | LayerSpec::Softsign {}
+                | LayerSpec::Dropout { .. }
+                | LayerSpec::Scale { .. } => {
+                    // The map counts as it leaves the activation.
+                    if let Some(mean) = means.last_mut().filter(|_| after_convolution) {
+                        mean.layer = index;
+                    }
+                }
+                LayerSpec::Flatten {} | LayerSpec::Dense { .. } => break,
+            }
+        }
+        // Beyond the last convolution nothing is multiplied, so nothing needs to be spread.
+        let last = steps.iter().rposition(|step| matches!(step, Step::Multiply(_)));
+        let last =
+            last.ok_or_else(|| Error::Usage("the network has no convolution, so there is no saliency".into()))?;
+        steps.truncate(last + 1);
+        let input = network.input();
+        let sides = steps.iter().filter_map(|step| match step {
+            Step::Spread([down, across]) => Some(down.from.max(down.to) * across.from.max(across.to)),
+            Step::Multiply(_) => None,
+        });
+        let largest = sides.max().unwrap_or(0).max(input.positions());
+        let room = || Vec::with_capacity(largest);
+        Ok(Saliency { steps, means, size: [input.h, input.w], map: room(), spread: room(), half_spread: room() })
+    }
+
+    /// Height and width of the map: those of the network's input.
+    pub fn size(&self) -> [usize; 2] {
+        self.size
+    }
+
+    /// The saliency of the last picture, in [0, 1], row by row. Empty before the first.
+    pub fn map(&self) -> &[f32] {
+        &self.map
+    }
+
+    /// Steers as [`Pilot::steer`] does, and computes the saliency on the way.
+    ///
+    /// # Errors
+    ///
+    /// As [`Pilot::steer`].
+    pub fn steer(&mut self, pilot: &mut Pilot, height: usize, width: usize, rgb: &[u8]) -> Result<f32> {
+        let means = &mut self.means;
+        let steering = pilot.steer_observed(height, width, rgb, &mut |layer, output| {
+            if let Some(mean) = means.iter_mut().find(|mean| mean.layer == layer) {
+                mean.take(output);
+            }
+        })?;
+        self.propagate();
+        Ok(steering)
+    }
+
+    fn propagate(&mut self) {
+        self.map.clear();
+        for step in self.steps.iter().rev() {
+            match step {
+                Step::Multiply(k) => {
+                    let values = &self.means[*k].values;
+                    if self.map.is_empty() {
+                        self.map.extend_from_slice(values);
+                    } else {
+                        self.map.iter_mut().zip(values).for_each(|(map, value)| *map *= value);
+                    }
+                    // Only relations count, and products of many maps would leave the range of f32.
+                    let most = self.map.iter().copied().fold(0.0, f32::max);
+                    if most > 0.0 {
+                        self.map.iter_mut().for_each(|value| *value /= most);
+                    }
+                }
+                Step::Spread([down, across]) => {
+                    spread(&self.map, *down, *across, &mut self.half_spread, &mut self.spread);
+                    std::mem::swap(&mut self.map, &mut self.spread);
+                }
+            }
+        }
+        let (low, high) = self.map.iter().fold((f32::INFINITY, 0.0f32), |(low, high), v| (low.min(*v), high.max(*v)));
+        let range = high - low;
+        self.map.iter_mut().for_each(|value| *value = if range > 0.0 { (*value - low) / range } else { 0.0 });
+    }
+
+    /// Colours `image`, the camera's picture, where the network was excited: yellow a little, red much. `preprocessing` is the
+    /// network's own. Before the first picture nothing is changed.
+    pub fn overlay(&self, preprocessing: &Preprocessing, image: &mut RgbImage) {
+        let ([map_h, map_w], [first, end]) = (self.size, preprocessing.rows);
+        if self.map.is_empty() {
+            return;
+        }
+        let at = |row: usize, column: usize| self.map[row.min(map_h - 1) * map_w + column.min(map_w - 1)];
+        let rows_per_px = preprocessing.source[0] as f32 / image.height as f32;
+        for row in 0..image.height {
+            let source = (row as f32 + 0.5) * rows_per_px;
+            if !(first as f32..end as f32).contains(&source) {
+                continue;
+            }
+            let y = ((source - first as f32) / (end - first) as f32 * map_h as f32 - 0.5).max(0.0);
+            for column in 0..image.width {
+                let x = ((column as f32 + 0.5) / image.width as f32 * map_w as f32 - 0.5).max(0.0);
+                let ((i, j), (t, u)) = ((y as usize, x as usize), (y.fract(), x.fract()));
+                let upper = at(i, j) * (1.0 - u) + at(i, j + 1) * u;
+                let lower = at(i + 1, j) * (1.0 - u) + at(i + 1, j + 1) * u;
+                let value = upper * (1.0 - t) + lower * t;
+                let (share, colour) = (OPACITY * value, [255.0, 230.0 * (1.0 - value), 0.0]);
+                let below = image.pixel(row, column);
+                let mixed = |k: usize| f32::from(below[k]) * (1.0 - share) + colour[k] * share;
+                image.set_pixel(row, column, std::array::from_fn(|k| mixed(k).round() as u8));
+            }
+        }
+    }
+}
+
+impl Mean {
+    /// Averages feature maps `[c][h][w]` over the channels; negative values count as 0.
+    fn take(&mut self, output: &[f32]) {
+        let positions = self.values.len();
+        self.values.fill(0.0);
+        for channel in output.chunks_exact(positions).take(self.channels) {
+            self.values.iter_mut().zip(channel).for_each(|(sum, value)| *sum += value.max(0.0));
+        }
+        self.values.iter_mut().for_each(|sum| *sum /= self.channels as f32);
+    }
+}
+
+/// Transposed convolution of `map` with ones: `out[i * stride - before + k] += map[i]` for `k` below the kernel size, first
+/// down into `half`, then across into `out`.
+fn spread(map: &[f32], down: Axis, across: Axis, half: &mut Vec<f32>, out: &mut Vec<f32>) {
+    half.clear();
+    half.resize(down.from * across.to, 0.0);
+    for i in 0..down.to {
+        for target in down.covered(i) {
+            let (row, below) = (&map[i * across.to..][..across.to], &mut half[target * across.to..][..across.to]);
+            below.iter_mut().zip(row).for_each(|(sum, value)| *sum += value);
+        }
+    }
+    out.clear();
+    out.resize(down.from * across.from, 0.0);
+    for row in 0..down.from {
+        let below = &mut out[row * across.from..][..across.from];
+        for j in 0..across.to {
+            let value = half[row * across.to + j];
+            across.covered(j).for_each(|target| below[target] += value);
+        }
+    }
+}
+
+impl Axis {
+    /// The inputs that output `i` covers.
+    fn covered(self, i: usize) -> std::ops::Range<usize> {
+        let begin = (i * self.stride) as isize - self.before;
+        let inside = |at: isize| at.clamp(0, self.from as isize) as usize;
+        inside(begin)..inside(begin + self.kernel as isize)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::model_file::{Model, TrainingRecord};
+    use crate::recipe::{Recipe, SHIPPED};
+    use steersman_kernels::Isa;
+
+    /// The definition, written out: sums over all pairs of input and output.
+    fn spread_directly(map: &[f32], down: Axis, across: Axis) -> Vec<f32> {
+        let mut out = vec![0.0; down.from * across.from];
+        for y in 0..down.from as isize {
+            for x in 0..across.from as isize {
+                for i in 0..down.to {
+                    for j in 0..across.to {
+                        let (k, l) = (
+                            y + down.before - (i * down.stride) as isize,
+                            x + across.before - (j * across.stride) as isize,
+                        );
+                        if (0..down.kernel as isize).contains(&k) && (0..across.kernel as isize).contains(&l) {
+                            out[y as usize * across.from + x as usize] += map[i * across.to + j];
+                        }
+                    }
+                }
+            }
+        }
+        out
+    }
+
+    #[test]
+    fn spreading_is_the_transposed_convolution_with_ones() {
+        let axis = |from, to, kernel, stride, before| Axis { from, to, kernel, stride, before };
+        for (down, across) in [
+            (axis(9, 7, 3, 1, 0), axis(11, 4, 5, 2, 0)),
+            (axis(8, 4, 3, 2, 0), axis(8, 8, 3, 1, 1)),
+            (axis(9, 4, 2, 2, 0), axis(10, 6, 1, 1, -2)),
+            (axis(6, 3, 2, 2, 0), axis(7, 4, 3, 2, 1)),
+        ] {
+            let map: Vec<f32> = (0..down.to * across.to).map(|i| ((i * 37 + 11) % 17) as f32).collect();
+            let (mut half, mut out) = (Vec::new(), Vec::new());
+            spread(&map, down, across, &mut half, &mut out);
+            assert_eq!(out, spread_directly(&map, down, across), "{down:?} {across:?}");
+        }
+    }
+
+    fn pilot(name: &str) -> Pilot {
+        let recipe = Recipe::find(name, &[]).unwrap();
+        let parameters = recipe.network(Isa::best()).unwrap().initialize(1);
+        let model = Model { recipe, parameters, record: TrainingRecord::default(), training_rows: vec![] };
+        Pilot::new(model, Isa::best()).unwrap()
+    }
+
+    fn picture() -> Vec<u8> {
+        (0..160 * 320 * 3usize).map(|i| (i.wrapping_mul(2_654_435_761) >> 13) as u8).collect()
+    }
+
+    #[test]
+    fn the_saliency_of_lenet_is_that_of_a_direct_computation() {
+        let mut pilot = pilot("lenet");
+        let mut saliency = Saliency::new(pilot.network()).unwrap();
+        let mut seen = Vec::new();
+        let steering = pilot
+            .steer_observed(160, 320, &picture(), &mut |layer, output| seen.push((layer, output.to_vec())))
+            .unwrap();
+        assert_eq!(saliency.steer(&mut pilot, 160, 320, &picture()).unwrap(), steering);
+        // Layers: scale, conv 3x3, ELU, pool 4x4, conv 3x3, ELU, pool, …
+        let mean = |layer: usize, positions: usize| -> Vec<f32> {
+            let output = &seen.iter().find(|(index, _)| *index == layer).unwrap().1;
+            let channels = output.len() / positions;
+            (0..positions)
+                .map(|p| (0..channels).map(|c| output[c * positions + p].max(0.0)).sum::<f32>() / channels as f32)
+                .collect()
+        };
+        let valid = |from: usize, to: usize, kernel: usize, stride: usize| Axis { from, to, kernel, stride, before: 0 };
+        let (first, second) = (mean(2, 62 * 62), mean(5, 13 * 13));
+        let up = spread_directly(&second, valid(15, 13, 3, 1), valid(15, 13, 3, 1));
+        let up = spread_directly(&up, valid(62, 15, 4, 4), valid(62, 15, 4, 4));
+        let product: Vec<f32> = up.iter().zip(&first).map(|(a, b)| a * b).collect();
+        let map = spread_directly(&product, valid(64, 62, 3, 1), valid(64, 62, 3, 1));
+        let (low, high) = map.iter().fold((f32::INFINITY, 0.0f32), |(l, h), v| (l.min(*v), h.max(*v)));
+        assert_eq!(saliency.size(), [64, 64]);
+        for (found, expected) in saliency.map().iter().zip(&map) {
+            assert!((found - (expected - low) / (high - low)).abs() < 1e-5, "{found} {expected}");
+        }
+    }
+
+    #[test]
+    fn every_recipe_has_a_saliency_in_its_range_that_colours_only_kept_rows() {
+        for (name, _) in SHIPPED {
+            let mut pilot = pilot(name);
+            let mut saliency = Saliency::new(pilot.network()).unwrap();
+            let before = pilot.steer(160, 320, &picture()).unwrap();
+            assert_eq!(saliency.steer(&mut pilot, 160, 320, &picture()).unwrap(), before, "{name}");
+            let [h, w] = saliency.size();
+            assert_eq!(saliency.map().len(), h * w, "{name}");
+            assert!(saliency.map().iter().all(|v| (0.0..=1.0).contains(v)) && saliency.map().contains(&1.0), "{name}");
+            let original = RgbImage { height: 160, width: 320, pixels: picture() };
+            let mut image = original.clone();
+            saliency.overlay(&pilot.recipe().preprocessing, &mut image);
+            let first = pilot.recipe().preprocessing.rows[0] * 320 * 3;
+            assert_eq!(image.pixels[..first], original.pixels[..first], "{name}");
+            assert_ne!(image, original, "{name}");
+        }
+    }
+
+    #[test]
+    fn a_network_without_convolution_has_none() {
+        let network =
+            Network::new(crate::engine::tensor::Shape::new(1, 4, 4), &[LayerSpec::Flatten {}], Isa::PORTABLE).unwrap();
+        assert!(Saliency::new(&network).unwrap_err().to_string().contains("no convolution"));
+    }
+}

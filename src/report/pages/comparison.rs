@@ -1,0 +1,298 @@
+//! Several runs side by side on one page: curves, figures, recipes, and the drives that lie in their folders.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use crate::error::{Error, Result};
+use crate::recipe::Recipe;
+use crate::report::charts::chart::{Axis, Chart, Mark};
+use crate::report::charts::map::{self, MapPoint};
+use crate::report::charts::palette;
+use crate::report::pages::html::Page;
+use crate::simulator::trial::trajectory::{
+    RUN_DEPTH, Waypoint, find_drives, read_summary, read_trajectory, trajectories,
+};
+use crate::simulator::{DriveSummary, Track};
+use crate::training::{EpochRecord, RunFolder, TrainResult};
+use steersman_kernels::Isa;
+
+/// Two charts side by side.
+const HALF: [f64; 2] = [552.0, 360.0];
+
+/// A run, read from its folder.
+#[derive(Debug)]
+pub struct RunView {
+    /// Name that tells it from the others.
+    pub name: String,
+    recipe: Recipe,
+    seed: u64,
+    history: Vec<EpochRecord>,
+    result: Option<TrainResult>,
+    drives: Vec<DriveView>,
+}
+
+/// A drive, as `drive --out` wrote it.
+#[derive(Debug)]
+struct DriveView {
+    summary: DriveSummary,
+    ways: Vec<Vec<MapPoint>>,
+}
+
+/// Reads the runs in `folders`.
+///
+/// # Errors
+///
+/// [`Error::Usage`] for what is no run folder, [`Error::Io`] and [`Error::Data`] for what cannot be read.
+pub fn read(folders: &[PathBuf]) -> Result<Vec<RunView>> {
+    let names = names(folders);
+    let read = |(path, name): (&PathBuf, String)| {
+        let folder = RunFolder::open(path)?;
+        let mut drives: Vec<DriveView> =
+            find_drives(path, RUN_DEPTH).iter().map(|folder| read_drive(folder)).collect::<Result<_>>()?;
+        drives.sort_by(|a, b| a.summary.track.cmp(&b.summary.track));
+        Ok(RunView {
+            name,
+            recipe: folder.recipe()?,
+            seed: folder.info()?.seed,
+            history: if folder.file("history.csv").is_file() { folder.history()? } else { Vec::new() },
+            result: folder.result()?,
+            drives,
+        })
+    };
+    folders.iter().zip(names).map(read).collect()
+}
+
+/// Last parts of the paths if they differ, else the whole paths.
+fn names(folders: &[PathBuf]) -> Vec<String> {
+    let last = |path: &PathBuf| path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
+    let short: Vec<String> = folders.iter().map(last).collect();
+    let differ = (1..short.len()).all(|i| !short[..i].contains(&short[i]));
+    if differ { short } else { folders.iter().map(|path| path.display().to_string()).collect() }
+}
+
+/// Reads the drive in `folder`.
+fn read_drive(folder: &Path) -> Result<DriveView> {
+    let assisted = trajectories(folder).into_iter().filter(|(kind, ..)| kind == "assisted");
+    let ways = assisted.map(|(_, _, path)| read_way(&path)).collect::<Result<_>>()?;
+    Ok(DriveView { summary: read_summary(folder)?, ways })
+}
+
+fn read_way(path: &Path) -> Result<Vec<MapPoint>> {
+    let place = |w: Waypoint| MapPoint { x: w.x_m, y: w.y_m, cte_m: w.cte_m, put_back: w.intervention > 0 };
+    Ok(read_trajectory(path)?.into_iter().map(place).collect())
+}
+
+/// The page.
+///
+/// # Errors
+///
+/// [`Error::Recipe`] and [`Error::Network`] for recipes that cannot be written out or built.
+pub fn page(runs: &[RunView]) -> Result<String> {
+    let names: Vec<&str> = runs.iter().map(|run| run.name.as_str()).collect();
+    let mut page = Page::new("Runs compared", &names.join(", "));
+    figures(&mut page, runs)?;
+    page.section("Learning curves");
+    page.drawings(&curves(runs));
+    page.section("What their recipes differ in");
+    let (keys, rows) = differences(runs)?;
+    if rows.is_empty() {
+        page.paragraph(if runs.len() > 1 { "Nothing." } else { "There is only one." });
+    } else {
+        let headers: Vec<&str> = std::iter::once("entry").chain(names.iter().copied()).collect();
+        let rows: Vec<Vec<String>> =
+            keys.into_iter().zip(rows).map(|(key, values)| std::iter::once(key).chain(values).collect()).collect();
+        page.table(&headers, &rows);
+    }
+    drives(&mut page, runs);
+    Ok(page.finish())
+}
+
+fn figures(page: &mut Page, runs: &[RunView]) -> Result<()> {
+    page.section("Figures");
+    let number = |value: Option<f64>, decimals: usize| value.map_or("-".to_string(), |v| format!("{v:.decimals$}"));
+    let mut rows = Vec::new();
+    for run in runs {
+        let network = run.recipe.network(Isa::PORTABLE)?;
+        let best = run
+            .history
+            .iter()
+            .filter(|r| r.val_mse.is_some())
+            .min_by(|a, b| a.val_mse.unwrap_or(f64::INFINITY).total_cmp(&b.val_mse.unwrap_or(f64::INFINITY)));
+        rows.push(vec![
+            run.name.clone(),
+            run.recipe.name.clone(),
+            run.seed.to_string(),
+            crate::engine::network::group_digits(network.count(true) as u64),
+            format!("{}{}", run.history.len(), if run.result.is_some() { "" } else { " (unfinished)" }),
+            best.map_or("-".into(), |best| best.epoch.to_string()),
+            number(run.history.last().map(|last| last.train_loss), 5),
+            number(best.and_then(|best| best.val_mse), 5),
+            number(best.and_then(|best| best.val_center_mse), 5),
+            number(best.and_then(|best| best.val_mae_deg), 2),
+            number(best.and_then(|best| best.relative_to_zero), 2),
+            number(run.result.as_ref().map(|result| result.seconds), 0),
+        ]);
+    }
+    let headers = [
+        "run",
+        "recipe",
+        "seed",
+        "trainable",
+        "epochs",
+        "best",
+        "training loss, last",
+        "validation MSE, best",
+        "centre MSE",
+        "MAE, degrees",
+        "÷ never steering",
+        "seconds",
+    ];
+    page.table(&headers, &rows);
+    page.paragraph("Validation errors of runs on different recordings, or with another split or camera choice, cannot be compared.");
+    Ok(())
+}
+
+fn curves(runs: &[RunView]) -> Vec<String> {
+    let chart = |title: &str, axis: Axis, value: fn(&EpochRecord) -> Option<f64>| {
+        runs.iter().enumerate().fold(Chart::new(title, HALF, Axis::new("epoch"), axis), |chart, (i, run)| {
+            let points =
+                run.history.iter().filter_map(|record| Some([f64::from(record.epoch), value(record)?])).collect();
+            chart.add(&run.name, palette::series(i), Mark::Line(2.0), points)
+        })
+    };
+    let loss = || Axis::new("squared error").log();
+    [
+        chart("Training loss", loss(), |record| Some(record.train_loss)),
+        chart("Validation MSE", loss(), |record| record.val_mse),
+        chart("Mean absolute error, centre camera", Axis::new("degrees"), |record| record.val_mae_deg),
+        chart("Learning rate", Axis::new("learning rate").log(), |record| Some(record.learning_rate)),
+    ]
+    .iter()
+    .map(Chart::draw)
+    .collect()
+}
+
+/// The entries that differ between the recipes, with the value in each run.
+fn differences(runs: &[RunView]) -> Result<(Vec<String>, Vec<Vec<String>>)> {
+    let mut tables = Vec::new();
+    for run in runs {
+        let text = run.recipe.to_toml()?;
+        let table: toml::Table = text
+            .parse()
+            .map_err(|e: toml::de::Error| Error::Recipe { recipe: run.name.clone(), message: e.to_string() })?;
+        let mut entries = BTreeMap::new();
+        flatten("", &toml::Value::Table(table), &mut entries);
+        tables.push(entries);
+    }
+    let mut keys: Vec<String> = tables.iter().flat_map(|table| table.keys().cloned()).collect();
+    keys.sort();
+    keys.dedup();
+    let values = |key: &String| -> Vec<String> {
+        tables.iter().map(|table| table.get(key).cloned().unwrap_or_else(|| "-".into())).collect()
+    };
+    let differing: Vec<(String, Vec<String>)> = keys
+        .into_iter()
+        .filter(|key| key != "about")
+        .map(|key| (key.clone(), values(&key)))
+        .filter(|(_, values)| values.iter().any(|value| *value != values[0]))
+        .collect();
+    Ok(differing.into_iter().unzip())
+}
+
+/// `a.b = value` for every entry of a table; layers are numbered from 1 and stand in one line each.
+fn flatten(key: &str, value: &toml::Value, entries: &mut BTreeMap<String, String>) {
+    match value {
+        toml::Value::Table(table) if !key.starts_with("layers") => {
+            for (name, value) in table {
+                let key = if key.is_empty() { name.clone() } else { format!("{key}.{name}") };
+                flatten(&key, value, entries);
+            }
+        }
+        toml::Value::Array(array) if key == "layers" => {
+            for (i, layer) in array.iter().enumerate() {
+                entries.insert(format!("layers {:02}", i + 1), layer.to_string().replace('\n', " "));
+            }
+        }
+        value => {
+            entries.insert(key.to_string(), value.to_string());
+        }
+    }
+}
+
+fn drives(page: &mut Page, runs: &[RunView]) {
+    page.section("On the road");
+    if runs.iter().all(|run| run.drives.is_empty()) {
+        page.paragraph(
+            "No drives lie in these folders (`train` without a recording puts some there). `steersman drive RUN/last.safetensors --track lake --out RUN/drives/lake` puts one there.",
+        );
+        return;
+    }
+    let mut rows = Vec::new();
+    let mut maps = BTreeMap::<String, Vec<String>>::new();
+    for run in runs {
+        for DriveView { summary, ways } in &run.drives {
+            rows.push(vec![
+                format!("{}{}", summary.track, if summary.held_out { " (held out)" } else { "" }),
+                run.name.clone(),
+                format!("{}/{}", summary.laps_completed, summary.laps_total),
+                format!("{:.1} %", summary.autonomy_percent),
+                summary.interventions.to_string(),
+                format!("{:.2} m", summary.cte_mean_m),
+                format!("{:.2} m", summary.cte_p95_m),
+                format!("{:.1} °/s", summary.whiteness_deg_s),
+            ]);
+            // A track file may be gone; the way alone says something as well.
+            let track = Track::load(&summary.track).ok();
+            let title = format!("{}: autonomy {:.0} %", run.name, summary.autonomy_percent);
+            maps.entry(summary.track.clone()).or_default().push(map::draw(
+                &title,
+                track.as_ref(),
+                ways,
+                [552.0, 430.0],
+            ));
+        }
+    }
+    rows.sort();
+    let headers =
+        ["track", "run", "laps", "autonomy", "interventions", "mean distance from line", "95 % below", "whiteness"];
+    page.table(&headers, &rows);
+    page.paragraph("The maps show the assisted runs: the car is put back when it is more than a metre from the line.");
+    for (track, maps) in maps {
+        page.subsection(&track);
+        page.drawings(&maps);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn run(name: &str, overrides: &[&str]) -> RunView {
+        let overrides: Vec<String> = overrides.iter().map(|text| text.to_string()).collect();
+        let recipe = Recipe::find("lenet", &overrides).unwrap();
+        RunView { name: name.into(), recipe, seed: 1, history: Vec::new(), result: None, drives: Vec::new() }
+    }
+
+    #[test]
+    fn only_what_differs_is_listed() {
+        let runs = [run("a", &[]), run("b", &["epochs=3", "optimizer.learning_rate=0.01", "name='other'"])];
+        let (keys, values) = differences(&runs).unwrap();
+        assert_eq!(keys, ["epochs", "name", "optimizer.learning_rate"]);
+        assert_eq!(values[0], ["10", "3"]);
+        assert!(differences(&runs[..1]).unwrap().0.is_empty());
+    }
+
+    #[test]
+    fn runs_of_the_same_name_are_told_apart_by_their_paths() {
+        let paths = |names: &[&str]| names.iter().map(PathBuf::from).collect::<Vec<_>>();
+        assert_eq!(names(&paths(&["x/a", "x/b"])), ["a", "b"]);
+        assert_eq!(names(&paths(&["x/a", "y/a"])), ["x/a", "y/a"]);
+    }
+
+    #[test]
+    fn runs_without_epochs_or_drives_have_a_page() {
+        let text = page(&[run("a", &[]), run("b", &[])]).unwrap();
+        crate::report::pages::html::assert_stands_alone(&text);
+        assert!(text.contains("(unfinished)") && text.contains("No drives"));
+    }
+}

@@ -1,0 +1,8 @@
+//! Pages that stand alone: of a training run, of a recording, of runs side by side, of what a model looks at.
+
+pub mod comparison;
+pub mod explanation;
+pub mod html;
+pub mod inspection;
+pub mod run;
+mod split_view;

@@ -1,0 +1,207 @@
+//! The split of recordings into training and validation, to be looked at.
+
+use crate::dataset::leak::LeakAudit;
+use crate::dataset::split::{GUARD_MS, Split};
+use crate::dataset::{Flip, Item, Recording};
+use crate::recipe::Recipe;
+use crate::report::charts::palette::{BLUE, INK, ORANGE, PALE, QUIET_INK, VERMILION};
+use crate::report::charts::steering::driven_times;
+use crate::report::charts::svg::{Anchor, Svg};
+use crate::report::pages::html::Page;
+
+/// Recordings drawn; the rest is counted.
+const MOST_STRIPS: usize = 24;
+/// Width of a strip, pixels.
+const WIDTH: f64 = 1120.0;
+/// Room for the name before the strip.
+const LEFT: f64 = 190.0;
+
+/// What becomes of a row.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Fate {
+    Training,
+    Validation,
+    /// Near a validation row, and used on neither side.
+    Guard,
+    /// Left out for its throttle or to balance the labels.
+    LeftOut,
+}
+
+impl Fate {
+    const ALL: [(Fate, &'static str, &'static str); 4] = [
+        (Fate::Training, BLUE, "training"),
+        (Fate::Validation, ORANGE, "validation"),
+        (Fate::Guard, VERMILION, "guard, on neither side"),
+        (Fate::LeftOut, PALE, "left out (balance, throttle)"),
+    ];
+
+    fn colour(self) -> &'static str {
+        Fate::ALL[self as usize].1
+    }
+}
+
+/// A split, row by row.
+#[derive(Clone, Debug)]
+pub struct SplitView {
+    strips: Vec<Strip>,
+    more: usize,
+    summary: String,
+    audit: LeakAudit,
+    /// The labels of an epoch's training images: with cameras and mirrors, without shifts.
+    pub training_labels: Vec<f32>,
+}
+
+#[derive(Clone, Debug)]
+struct Strip {
+    name: String,
+    length_s: f64,
+    /// Stretches with the same fate, from and to in seconds driven.
+    stretches: Vec<(f64, f64, Fate)>,
+}
+
+impl SplitView {
+    /// What `split` makes of `recordings`.
+    pub fn of(recordings: &[Recording], split: &Split, recipe: &Recipe) -> SplitView {
+        let strips = recordings.iter().enumerate().take(MOST_STRIPS);
+        SplitView {
+            strips: strips.map(|(i, recording)| Strip::of(i, recording, split)).collect(),
+            more: recordings.len().saturating_sub(MOST_STRIPS),
+            summary: split.summary(),
+            audit: LeakAudit::of(split, recordings),
+            training_labels: training_labels(recordings, split, recipe),
+        }
+    }
+
+    /// Adds the split in words and as strips over time to `page`.
+    pub fn describe(&self, page: &mut Page) {
+        for line in self.summary.lines() {
+            page.paragraph(&format!("{line}."));
+        }
+        page.drawings(&[self.draw()]);
+        if self.more > 0 {
+            page.paragraph(&format!("And {} more recordings.", self.more));
+        }
+        page.advice(&format!("{}.", self.audit.summary()), self.audit.share() < 0.01);
+    }
+
+    fn draw(&self) -> String {
+        const STEP: f64 = 34.0;
+        let height = 70.0 + STEP * self.strips.len() as f64;
+        let mut svg = Svg::new(WIDTH, height);
+        let mut x = LEFT;
+        for (fate, colour, name) in Fate::ALL {
+            let style = if fate == Fate::LeftOut {
+                "fill=\"#ececec\" stroke=\"#888888\"".into()
+            } else {
+                format!("fill=\"{colour}\"")
+            };
+            svg.rect([x, 10.0], [14.0, 14.0], &style);
+            svg.text([x + 20.0, 22.0], 13.0, Anchor::Start, "", name);
+            x += 40.0 + crate::report::charts::svg::text_width(name, 13.0);
+        }
+        let longest_s = self.strips.iter().map(|strip| strip.length_s).fold(1e-9, f64::max);
+        let place = |s: f64| LEFT + s / longest_s * (WIDTH - LEFT - 20.0);
+        for (i, strip) in self.strips.iter().enumerate() {
+            let top = 36.0 + STEP * i as f64;
+            svg.text([LEFT - 10.0, top + 16.0], 13.0, Anchor::End, "", &shortened(&strip.name, 26));
+            for (from, to, fate) in &strip.stretches {
+                let width = (place(*to) - place(*from)).max(0.6);
+                svg.rect([place(*from), top], [width, 24.0], &format!("fill=\"{}\"", fate.colour()));
+            }
+        }
+        let bottom = 36.0 + STEP * self.strips.len() as f64;
+        let step = [5.0, 10.0, 30.0, 60.0, 120.0, 300.0, 600.0, 1800.0, 3600.0, 36_000.0];
+        let step = step.into_iter().find(|step| longest_s / step <= 12.0).unwrap_or(longest_s);
+        for k in 0..=(longest_s / step) as usize {
+            let at = place(k as f64 * step);
+            svg.line([at, bottom - 6.0], [at, bottom], &format!("stroke=\"{INK}\""));
+            svg.text([at, bottom + 14.0], 12.0, Anchor::Middle, "", &format!("{:.0}", k as f64 * step));
+        }
+        let label = "time driven, s";
+        svg.text([LEFT - 10.0, bottom + 14.0], 13.0, Anchor::End, &format!("fill=\"{QUIET_INK}\""), label);
+        svg.finish()
+    }
+}
+
+impl Strip {
+    fn of(index: usize, recording: &Recording, split: &Split) -> Strip {
+        let times = driven_times(recording);
+        let mut fates = vec![Fate::LeftOut; recording.rows.len()];
+        let here = |side: &[Item]| -> Vec<usize> {
+            side.iter().filter(|item| usize::from(item.recording) == index).map(|item| item.row as usize).collect()
+        };
+        let validation = here(&split.validation);
+        // A row may be on both sides where single images are split: validation is drawn last.
+        here(&split.training).into_iter().for_each(|row| fates[row] = Fate::Training);
+        for &row in &validation {
+            let session = recording.sessions[recording.session_of(row)].clone();
+            let near = |other: &usize| (recording.rows[*other].time_ms - recording.rows[row].time_ms).abs() <= GUARD_MS;
+            let before = (session.start..row).rev().take_while(near);
+            let after = (row + 1..session.end).take_while(near);
+            before.chain(after).filter(|_| !split.spec.mode.leaks()).for_each(|other| {
+                if fates[other] == Fate::LeftOut {
+                    fates[other] = Fate::Guard;
+                }
+            });
+        }
+        validation.into_iter().for_each(|row| fates[row] = Fate::Validation);
+        let mut stretches: Vec<(f64, f64, Fate)> = Vec::new();
+        for session in &recording.sessions {
+            for row in session.clone() {
+                let end = times.get(row + 1).filter(|_| row + 1 < session.end).copied().unwrap_or(times[row] + 0.1);
+                match stretches.last_mut() {
+                    Some((_, to, fate)) if *fate == fates[row] && row > session.start => *to = end,
+                    _ => stretches.push((times[row], end, fates[row])),
+                }
+            }
+        }
+        let name = recording.path.file_name().unwrap_or(recording.path.as_os_str()).to_string_lossy().into_owned();
+        Strip { name, length_s: times.last().copied().unwrap_or(0.0), stretches }
+    }
+}
+
+fn training_labels(recordings: &[Recording], split: &Split, recipe: &Recipe) -> Vec<f32> {
+    let labels = split.training.iter().flat_map(|item| {
+        let steering = item.steering(recordings);
+        item.cameras().map(move |camera| recipe.samples.label(steering, camera))
+    });
+    match recipe.samples.flip {
+        Flip::None => labels.collect(),
+        Flip::Both => labels.flat_map(|label| [label, -label]).collect(),
+        // One in two is mirrored; for the histogram it does not matter which.
+        Flip::Random => labels.enumerate().map(|(i, label)| if i % 2 == 0 { label } else { -label }).collect(),
+    }
+}
+
+/// The end of a name that is too long.
+fn shortened(name: &str, most: usize) -> String {
+    let count = name.chars().count();
+    if count <= most { name.into() } else { format!("…{}", name.chars().skip(count - most + 1).collect::<String>()) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::dataset::testing::recording_of;
+
+    #[test]
+    fn every_row_has_its_fate() {
+        let labels: Vec<f32> = (0..1200).map(|i| if i % 3 == 0 { 0.0 } else { 0.3 }).collect();
+        let recordings = [recording_of(&labels, 100)];
+        let recipe = Recipe::find("lenet", &[]).unwrap();
+        let split =
+            crate::dataset::split::split(&recordings, &recipe.split, &recipe.samples, &recipe.balance, 1).unwrap();
+        let view = SplitView::of(&recordings, &split, &recipe);
+        let seconds = |wanted: Fate| -> f64 {
+            view.strips[0].stretches.iter().filter(|s| s.2 == wanted).map(|(from, to, _)| to - from).sum()
+        };
+        assert!((seconds(Fate::Validation) - 0.1 * split.validation.len() as f64).abs() < 1e-6);
+        assert!((seconds(Fate::Training) - 0.1 * split.training.len() as f64).abs() < 1e-6);
+        assert!((seconds(Fate::LeftOut) - 0.1 * split.balanced_rows as f64).abs() < 3.0);
+        assert!(split.guard_rows >= 10);
+        assert!((seconds(Fate::Guard) - 0.1 * split.guard_rows as f64).abs() < 0.3, "{}", seconds(Fate::Guard));
+        // Three cameras, no mirror; the left camera's labels are 0.25 higher.
+        assert_eq!(view.training_labels.len(), 3 * split.training.len());
+        assert_eq!(view.training_labels[1] - view.training_labels[0], 0.25);
+    }
+}

@@ -1,0 +1,66 @@
+//! The front camera of a run, with the light that its seed draws.
+
+use crate::Result;
+use crate::simulator::camera::jpeg;
+use crate::simulator::camera::pinhole::{Camera, Mount, RgbFrame};
+use crate::simulator::camera::renderer::Renderer;
+use crate::simulator::car::pose::BodyPose;
+use crate::simulator::car::simulation::Simulation;
+use crate::simulator::scenery::light::Variant;
+use crate::simulator::track::Track;
+
+/// Takes the pictures that a driver sees. Keeps its buffers.
+pub struct FrontCamera<'a> {
+    track: &'a Track,
+    variant: Variant,
+    renderer: Renderer,
+    frame: RgbFrame,
+    bytes: Vec<u8>,
+}
+
+impl<'a> FrontCamera<'a> {
+    /// The camera of the run `seed`.
+    pub fn new(track: &'a Track, seed: u64) -> FrontCamera<'a> {
+        FrontCamera {
+            track,
+            variant: Variant::new(track.world(), seed),
+            renderer: Renderer::default(),
+            frame: RgbFrame::default(),
+            bytes: Vec::new(),
+        }
+    }
+
+    /// The JPEG of what is before the car.
+    ///
+    /// # Errors
+    /// If the picture cannot be encoded.
+    pub fn jpeg(&mut self, simulation: &Simulation) -> Result<&[u8]> {
+        self.take(&simulation.body_pose())
+    }
+
+    fn take(&mut self, body: &BodyPose) -> Result<&[u8]> {
+        let camera = Camera::new(body, Mount::Center);
+        self.renderer.render(self.track.world(), &self.variant, &camera, Mount::Center, &mut self.frame);
+        self.bytes.clear();
+        jpeg::encode(&self.frame, &mut self.bytes)?;
+        Ok(&self.bytes)
+    }
+
+    /// The same, decoded again: what is left of the picture after JPEG.
+    ///
+    /// # Errors
+    /// If the picture cannot be encoded or decoded.
+    pub fn look(&mut self, simulation: &Simulation) -> Result<&RgbFrame> {
+        self.look_from(&simulation.body_pose())
+    }
+
+    /// The same for a car whose body is at `body`.
+    ///
+    /// # Errors
+    /// As [`look`](FrontCamera::look).
+    pub fn look_from(&mut self, body: &BodyPose) -> Result<&RgbFrame> {
+        self.take(body)?;
+        jpeg::decode(&self.bytes, &mut self.frame)?;
+        Ok(&self.frame)
+    }
+}
