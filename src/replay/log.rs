@@ -2,8 +2,9 @@
 
 use std::ops::Range;
 
-use crate::dataset::decode::{RgbImage, decode_rgb};
-use crate::dataset::{Camera, Recording};
+use crate::picture::RgbImage;
+use crate::picture::decode::decode_rgb;
+use crate::dataset::{Recording, View};
 use crate::error::{Error, Result};
 use crate::geometry::{CarGeometry, DrivenPath};
 
@@ -88,7 +89,7 @@ impl<'a> ReplayLog<'a> {
 pub struct Frames {
     file: Vec<u8>,
     image: RgbImage,
-    held: Option<(usize, Camera)>,
+    held: Option<(usize, View)>,
 }
 
 impl Frames {
@@ -97,7 +98,7 @@ impl Frames {
     /// # Errors
     ///
     /// [`Error::Io`] and [`Error::Data`] with its path if it cannot be read.
-    pub fn get(&mut self, recording: &Recording, row: usize, camera: Camera) -> Result<&RgbImage> {
+    pub fn get(&mut self, recording: &Recording, row: usize, camera: View) -> Result<&RgbImage> {
         if self.held != Some((row, camera)) {
             self.held = None;
             let path = recording.image_path(row, camera).ok_or_else(|| {

@@ -4,8 +4,8 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::log::{Frames, ReplayLog, ReplaySession};
-use crate::dataset::Camera;
-use crate::dataset::decode::RgbImage;
+use crate::dataset::View;
+use crate::picture::RgbImage;
 use crate::error::{Error, Result};
 use crate::geometry::{CarGeometry, LookAhead, Offset, PixelGrid, ViewWarp};
 
@@ -239,11 +239,11 @@ impl Eye {
     fn look(&mut self, log: &ReplayLog, session: &ReplaySession, row: usize, offset: Offset) -> Result<&RgbImage> {
         let row = session.rows.start + row;
         let [left_m, right_m] = log.geometry.side_offsets_m;
-        let (camera, taken_m) = [(Camera::Centre, 0.0), (Camera::Left, left_m), (Camera::Right, right_m)]
+        let (camera, taken_m) = [(View::Centre, 0.0), (View::Left, left_m), (View::Right, right_m)]
             .into_iter()
             .filter(|(camera, _)| log.recording.row_has(row, *camera))
             .min_by(|a, b| (offset.right_m - a.1).abs().total_cmp(&(offset.right_m - b.1).abs()))
-            .unwrap_or((Camera::Centre, 0.0));
+            .unwrap_or((View::Centre, 0.0));
         let picture = self.frames.get(log.recording, row, camera)?;
         let size = [picture.height, picture.width];
         let warp = ViewWarp::new(&log.geometry, PixelGrid::whole(&log.geometry, size), taken_m, offset);

@@ -4,7 +4,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::log::{Frames, ReplayLog};
-use crate::dataset::Camera;
+use crate::dataset::View;
 use crate::error::Result;
 use crate::geometry::{Offset, PixelGrid, ViewWarp};
 
@@ -41,7 +41,7 @@ impl WarpCheck {
 /// Pictures that cannot be read.
 pub fn side_camera_check(log: &ReplayLog) -> Result<Option<WarpCheck>> {
     let rows: Vec<usize> = (log.sessions.iter().flat_map(|session| session.rows.clone()))
-        .filter(|&row| Camera::ALL.iter().all(|&camera| log.recording.row_has(row, camera)))
+        .filter(|&row| View::ALL.iter().all(|&camera| log.recording.row_has(row, camera)))
         .collect();
     if rows.is_empty() || log.geometry.side_offsets_m == [0.0, 0.0] {
         return Ok(None);
@@ -64,11 +64,11 @@ pub fn side_camera_check(log: &ReplayLog) -> Result<Option<WarpCheck>> {
 
 /// Mean difference in grey levels of both side pictures from the warped and from the unwarped centre picture.
 fn errors(log: &ReplayLog, frames: &mut Frames, row: usize) -> Result<[f64; 2]> {
-    let centre = frames.get(log.recording, row, Camera::Centre)?.clone();
+    let centre = frames.get(log.recording, row, View::Centre)?.clone();
     let grid = PixelGrid::whole(&log.geometry, [centre.height, centre.width]);
     let mut predicted = vec![0; centre.pixels.len()];
     let (mut sums, mut n) = ([0u64; 2], 0u64);
-    for (camera, wanted_m) in [Camera::Left, Camera::Right].into_iter().zip(log.geometry.side_offsets_m) {
+    for (camera, wanted_m) in [View::Left, View::Right].into_iter().zip(log.geometry.side_offsets_m) {
         let warp = ViewWarp::between(&log.geometry, grid, 0.0, Offset::default(), wanted_m);
         warp.apply(&centre.pixels, &mut predicted);
         let real = frames.get(log.recording, row, camera)?;
