@@ -27,6 +27,7 @@ mod inspect;
 mod predict;
 mod progress;
 mod record;
+mod replay;
 mod serve;
 mod share_bar;
 mod sim;

@@ -2,16 +2,18 @@
 
 use std::ops::Range;
 
+use crate::dataset::{Kind, Recording, View};
+use crate::error::{Error, Result};
+use crate::geometry::{CarGeometry, DrivenPath, LookAhead};
 use crate::picture::RgbImage;
 use crate::picture::decode::decode_rgb;
-use crate::dataset::{Recording, View};
-use crate::error::{Error, Result};
-use crate::geometry::{CarGeometry, DrivenPath};
 
 /// Metres a second in a mile an hour.
 const MPS_PER_MPH: f64 = 0.447_04;
 /// Sessions with a shorter path cannot be driven, m.
 const MIN_PATH_M: f64 = 20.0;
+/// A car that makes less way stands, in wheelbases a second.
+const STANDING_WHEELBASES_PER_S: f64 = 0.1;
 /// Speed of a recording that says none, in wheelbases a second: 1.3 m/s for a small car, and no more than a guess.
 const ASSUMED_WHEELBASES_PER_S: f64 = 5.0;
 
@@ -57,7 +59,7 @@ impl<'a> ReplayLog<'a> {
         Ok(ReplayLog { sessions, ..log })
     }
 
-    /// All sessions of `recording`, for labels.
+    /// All sessions of `recording`, also those that are too short to be driven.
     pub fn of_any_length(recording: &'a Recording, geometry: CarGeometry) -> ReplayLog<'a> {
         let known = recording.rows.iter().any(|row| row.speed_mph.is_finite());
         let assumed_mps = ASSUMED_WHEELBASES_PER_S * geometry.wheelbase_m;
@@ -81,6 +83,30 @@ impl<'a> ReplayLog<'a> {
             })
             .collect();
         ReplayLog { recording, geometry, sessions, assumed_speed_mps: (!known).then_some(assumed_mps) }
+    }
+}
+
+impl ReplayLog<'_> {
+    /// The path label of each row of the recording: pursuit of the driven path, `look_ahead` ahead. `None` for rows near the end of
+    /// their session, where there is no path ahead, and for rows where the car stands.
+    pub fn path_labels(&self, look_ahead: LookAhead) -> Vec<Option<f32>> {
+        let mut labels = vec![None; self.recording.rows.len()];
+        for session in &self.sessions {
+            for (row, &speed_mps) in session.speed_mps.iter().enumerate() {
+                let moves = speed_mps > STANDING_WHEELBASES_PER_S * self.geometry.wheelbase_m;
+                let label = session.path.label(&self.geometry, row, look_ahead.distance_m(speed_mps));
+                labels[session.rows.start + row] = label.filter(|_| moves).map(|label| label as f32);
+            }
+        }
+        labels
+    }
+}
+
+/// The preset for recordings of this kind, for those that say nothing of their camera.
+pub fn usual_preset(recording: &Recording) -> &'static str {
+    match recording.kind {
+        Kind::Tub => "donkeycar",
+        _ => "udacity",
     }
 }
 

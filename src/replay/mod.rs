@@ -12,6 +12,9 @@ mod log;
 mod run;
 mod trust;
 
-pub use log::{Frames, ReplayLog, ReplaySession};
-pub use run::{MAX_OFFSET_M, MAX_TURN_DEG, ReplayFrame, ReplayMoment, ReplayOptions, ReplayRun, ReplaySummary, replay, summarise};
+pub use log::{Frames, ReplayLog, ReplaySession, usual_preset};
+pub use run::{
+    MAX_OFFSET_M, MAX_TURN_DEG, ReplayFrame, ReplayMoment, ReplayOptions, ReplayRun, ReplaySummary, moments_csv,
+    replay, summarise,
+};
 pub use trust::{WarpCheck, side_camera_check};

@@ -5,9 +5,9 @@ use serde::{Deserialize, Serialize};
 
 use super::log::{Frames, ReplayLog, ReplaySession};
 use crate::dataset::View;
-use crate::picture::RgbImage;
 use crate::error::{Error, Result};
 use crate::geometry::{CarGeometry, LookAhead, Offset, PixelGrid, ViewWarp};
+use crate::picture::RgbImage;
 
 /// Frames that a driver sees in each second, as in the simulator.
 const DRIVE_HZ: f64 = 20.0;
@@ -279,4 +279,28 @@ pub fn summarise(runs: &[ReplayRun], seconds: f64) -> ReplaySummary {
         frames: offsets.len(),
         frames_per_second: offsets.len() as f64 / seconds.max(1e-9),
     }
+}
+
+/// The moments of a drive as CSV, one a line, with a header.
+pub fn moments_csv(run: &ReplayRun) -> String {
+    let mut text =
+        String::from("time_s,row,x_m,y_m,heading_deg,along_m,offset_m,turn_deg,steering,pursuit,speed_mps,put_back\n");
+    for m in &run.moments {
+        text += &format!(
+            "{:.3},{},{:.4},{:.4},{:.3},{:.3},{:.4},{:.3},{:.6},{:.6},{:.3},{}\n",
+            m.time_s,
+            m.row,
+            m.x_m,
+            m.y_m,
+            m.heading_deg,
+            m.along_m,
+            m.offset_m,
+            m.turn_deg,
+            m.steering,
+            m.pursuit,
+            m.speed_mps,
+            u8::from(m.put_back)
+        );
+    }
+    text
 }

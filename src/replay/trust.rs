@@ -48,8 +48,10 @@ pub fn side_camera_check(log: &ReplayLog) -> Result<Option<WarpCheck>> {
     }
     let step = rows.len().div_ceil(ROWS);
     let looked_at: Vec<usize> = rows.into_iter().step_by(step).collect();
-    let found: Vec<[f64; 2]> =
-        looked_at.par_iter().map_init(Frames::default, |frames, &row| errors(log, frames, row)).collect::<Result<_>>()?;
+    let found: Vec<[f64; 2]> = looked_at
+        .par_iter()
+        .map_init(Frames::default, |frames, &row| errors(log, frames, row))
+        .collect::<Result<_>>()?;
     let mean = |side: usize| found.iter().map(|pair| pair[side]).sum::<f64>() / found.len() as f64;
     let doubtful: Vec<usize> =
         looked_at.iter().zip(&found).filter(|(_, pair)| pair[0] > 0.5 * pair[1]).map(|(&row, _)| row).collect();
