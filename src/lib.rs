@@ -74,14 +74,15 @@
 //! # Train on numbers of your own
 //!
 //! ```
-//! use steersman::engine::network::{LayerSpec, Network, StepInput, TrainingPlan};
+//! use steersman::engine::layers::DenseSpec;
+//! use steersman::engine::network::{Network, StepInput, TrainingPlan};
 //! use steersman::engine::optimizer::{Optimizer, OptimizerSpec};
 //! use steersman::engine::tensor::{Initializer, Shape};
 //! use steersman::engine::loss::Loss;
 //! use steersman_kernels::Isa;
 //!
 //! // y = x1 − x2, learned by one dense layer.
-//! let layers = [LayerSpec::Dense { units: 1, init: Initializer::GlorotUniform }];
+//! let layers = [DenseSpec { units: 1, init: Initializer::GlorotUniform }.into()];
 //! let network = Network::new(Shape::vector(2), &layers, Isa::best())?;
 //! let (x, labels) = ([1.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.5, 1.0], [1.0, -1.0, 0.0, -0.5]);
 //!
@@ -148,30 +149,56 @@
 //! ```
 #![forbid(unsafe_code)]
 
+#[cfg(feature = "cli")]
 pub mod cli;
+#[cfg(feature = "training")]
 pub mod dataset;
 pub mod engine;
 pub mod error;
+#[cfg(feature = "exchange")]
 pub mod exchange;
+#[cfg(feature = "training")]
 pub mod files;
+#[cfg(feature = "training")]
 pub mod geometry;
+#[cfg(feature = "live")]
 pub mod live;
+#[cfg(feature = "cli")]
 pub mod main_job;
+#[cfg(feature = "training")]
 pub mod metrics;
+#[cfg(feature = "training")]
 pub mod model_file;
+#[cfg(any(feature = "live", feature = "serve"))]
+#[cfg_attr(not(feature = "serve"), allow(dead_code, reason = "the live page alone needs a part of it"))]
 mod net;
+#[cfg(feature = "training")]
 pub mod observer;
+#[cfg(feature = "training")]
 pub mod picture;
+#[cfg(feature = "training")]
 pub mod pilot;
+#[cfg(feature = "training")]
 pub mod recipe;
+#[cfg(feature = "training")]
 pub mod replay;
+#[cfg(feature = "report")]
 pub mod report;
+#[cfg(feature = "serve")]
 pub mod serve;
+#[cfg(feature = "simulator")]
 pub mod simulator;
+#[cfg(feature = "serve")]
 pub mod simulator_client;
+#[cfg(feature = "simulator")]
 mod statistics;
+mod suggestion;
+#[cfg(feature = "training")]
+#[cfg_attr(not(feature = "cli"), allow(dead_code, reason = "the smaller feature sets show less foreign text"))]
 mod text;
+#[cfg(feature = "training")]
 pub mod training;
+#[cfg(feature = "serve")]
 pub mod udacity;
 
 pub use error::{Error, Result};

@@ -14,7 +14,6 @@ use crate::picture::{
     decode::{MAX_SIDE, decode_rgb_within},
 };
 use crate::recipe::Recipe;
-use crate::simulator::{DriveState, Driver, HEIGHT, RgbFrame, WIDTH};
 
 /// A model with everything planned to predict one image after the other on the calling thread.
 ///
@@ -185,13 +184,6 @@ impl Pilot {
             Error::Codec(message) | Error::Input(message) => Error::data(path, message),
             other => other,
         })
-    }
-}
-
-impl Driver for Pilot {
-    fn steer(&mut self, frame: &RgbFrame, _: &DriveState) -> f32 {
-        // A frame always has the size it says, so this cannot fail; the simulator takes what is no number as straight ahead.
-        Pilot::steer(self, HEIGHT, WIDTH, &frame.pixels).unwrap_or(f32::NAN)
     }
 }
 

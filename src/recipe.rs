@@ -21,6 +21,7 @@ use crate::engine::network::{LayerSpec, Network};
 use crate::engine::optimizer::{OptimizerSpec, Schedule, ScheduleSpec};
 use crate::engine::tensor::Shape;
 use crate::error::{Error, Result};
+use crate::suggestion::did_you_mean;
 
 /// Name and text of each recipe that is built in.
 pub const SHIPPED: [(&str, &str); 5] = [
@@ -257,16 +258,6 @@ fn set(table: &mut toml::Table, entry: &str) -> Result<(), String> {
     }
     inner.insert(last.into(), parsed);
     Ok(())
-}
-
-/// ` (did you mean …?)` with the nearest of `known`, or nothing if none is near.
-pub fn did_you_mean(name: &str, known: &[&str]) -> String {
-    known
-        .iter()
-        .map(|candidate| (strsim::damerau_levenshtein(name, candidate), candidate))
-        .min()
-        .filter(|(distance, candidate)| *distance <= 1 + name.len().max(candidate.len()) / 3)
-        .map_or(String::new(), |(_, candidate)| format!(" (did you mean `{candidate}`?)"))
 }
 
 /// Adds the nearest known name to serde's «unknown field `x`, expected one of `a`, `b`».

@@ -2,7 +2,8 @@
 
 use crate::dataset::preprocess::Preprocessing;
 use crate::error::{Error, Result};
-use crate::recipe::{Recipe, SHIPPED, did_you_mean};
+use crate::recipe::{Recipe, SHIPPED};
+use crate::suggestion::did_you_mean;
 
 /// Name and text of each preset; the files say where they come from.
 pub const PRESETS: [(&str, &str); 6] = [

@@ -2,3 +2,4 @@
 
 pub mod atomic_file;
 pub mod new_folder;
+pub mod zip_archive;

@@ -6,4 +6,6 @@
 pub mod charts;
 pub mod explain;
 pub mod pages;
+pub mod tone;
+#[cfg(feature = "video")]
 pub mod video;

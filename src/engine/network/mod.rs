@@ -27,7 +27,7 @@ use crate::engine::layers::{Layer, ParamSpec};
 use crate::engine::random::{Purpose, rng};
 use crate::engine::tensor::Shape;
 use crate::error::{Error, Result};
-use crate::recipe::did_you_mean;
+use crate::suggestion::did_you_mean;
 
 /// Layers in order, each knowing its input shape.
 #[derive(Debug)]

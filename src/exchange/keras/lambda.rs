@@ -4,21 +4,20 @@
 //! the stack lie constants and expressions `factor · x + offset`. Any instruction that leads away from these, or that is not
 //! known, makes the function unknown, and the user has to say what it computes.
 
-use base64::Engine as _;
-use base64::engine::general_purpose::STANDARD;
+use data_encoding::BASE64;
 use serde_json::Value;
 
 use super::marshal::{self, Layout, Object};
 
 /// `x · factor + offset`.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Affine {
+pub(super) struct LambdaAffine {
     pub factor: f64,
     pub offset: f64,
 }
 
 /// The function in the configuration of a `Lambda` layer, or why it cannot be told.
-pub(super) fn function(config: &serde_json::Map<String, Value>) -> Result<Affine, String> {
+pub(super) fn function(config: &serde_json::Map<String, Value>) -> Result<LambdaAffine, String> {
     let has_extras = |value: Option<&Value>| {
         value.is_some_and(|value| match value {
             Value::Null => false,
@@ -49,7 +48,7 @@ pub(super) fn function(config: &serde_json::Map<String, Value>) -> Result<Affine
 /// The bytes of marshalled code: Keras 1 wrote them as characters (Python's `raw_unicode_escape`), its successors in Base64.
 fn code_bytes(text: &str) -> Vec<u8> {
     let packed: String = text.chars().filter(|c| !c.is_ascii_whitespace()).collect();
-    if let Ok(bytes) = STANDARD.decode(packed)
+    if let Ok(bytes) = BASE64.decode(packed.as_bytes())
         && bytes.first().is_some_and(|kind| kind & 0x7f == b'c')
     {
         return bytes;
@@ -65,7 +64,7 @@ fn code_bytes(text: &str) -> Vec<u8> {
 }
 
 /// The function that the marshalled code computes, if it is of that form.
-pub(super) fn affine(code: &[u8]) -> Option<Affine> {
+pub(super) fn affine(code: &[u8]) -> Option<LambdaAffine> {
     Layout::ALL.into_iter().find_map(|layout| {
         let object = marshal::code(code, layout)?;
         let Object::Code(code) = &*object else { return None };
@@ -179,14 +178,14 @@ impl Dialect {
 #[derive(Clone, Copy, Debug)]
 enum Symbol {
     Number { value: f64, whole: bool },
-    Expression(Affine),
+    Expression(LambdaAffine),
 }
 
 /// x itself.
-const ARGUMENT: Symbol = Symbol::Expression(Affine { factor: 1.0, offset: 0.0 });
+const ARGUMENT: Symbol = Symbol::Expression(LambdaAffine { factor: 1.0, offset: 0.0 });
 
 /// Follows the instructions; `None` if they compute anything but one expression in x.
-fn run(instructions: &[Instruction], constants: &[std::rc::Rc<Object>]) -> Option<Affine> {
+fn run(instructions: &[Instruction], constants: &[std::rc::Rc<Object>]) -> Option<LambdaAffine> {
     let mut stack = Vec::new();
     for (place, instruction) in instructions.iter().enumerate() {
         let symbol = match *instruction {
@@ -219,8 +218,8 @@ fn run(instructions: &[Instruction], constants: &[std::rc::Rc<Object>]) -> Optio
 fn scaled(symbol: Symbol, by: f64) -> Symbol {
     match symbol {
         Symbol::Number { value, whole } => Symbol::Number { value: value * by, whole },
-        Symbol::Expression(Affine { factor, offset }) => {
-            Symbol::Expression(Affine { factor: factor * by, offset: offset * by })
+        Symbol::Expression(LambdaAffine { factor, offset }) => {
+            Symbol::Expression(LambdaAffine { factor: factor * by, offset: offset * by })
         }
     }
 }
@@ -231,10 +230,10 @@ fn combined(instruction: Instruction, left: Symbol, right: Symbol) -> Option<Sym
     let sum = |left: Symbol, right: Symbol| match (left, right) {
         (Number { value: a, whole: x }, Number { value: b, whole: y }) => Number { value: a + b, whole: x && y },
         (Number { value, .. }, Expression(a)) | (Expression(a), Number { value, .. }) => {
-            Expression(Affine { offset: a.offset + value, ..a })
+            Expression(LambdaAffine { offset: a.offset + value, ..a })
         }
         (Expression(a), Expression(b)) => {
-            Expression(Affine { factor: a.factor + b.factor, offset: a.offset + b.offset })
+            Expression(LambdaAffine { factor: a.factor + b.factor, offset: a.offset + b.offset })
         }
     };
     Some(match (instruction, left, right) {
@@ -253,7 +252,7 @@ fn combined(instruction: Instruction, left: Symbol, right: Symbol) -> Option<Sym
             Number { value: a / b, whole: false }
         }
         (Instruction::Divide | Instruction::DivideWhole, Expression(a), Number { value, .. }) => {
-            Expression(Affine { factor: a.factor / value, offset: a.offset / value })
+            Expression(LambdaAffine { factor: a.factor / value, offset: a.offset / value })
         }
         _ => return None,
     })
@@ -317,10 +316,10 @@ mod tests {
     #[test]
     fn both_ways_of_writing_code_are_read() {
         let (_, code) = cases().remove(0);
-        let expected = Affine { factor: 1.0 / 127.5, offset: -1.0 };
+        let expected = LambdaAffine { factor: 1.0 / 127.5, offset: -1.0 };
         let characters: String = code.iter().map(|byte| char::from(*byte)).collect();
         let keras1 = json!({"function": [characters, null, null], "arguments": {}});
-        let mut lines = STANDARD.encode(&code);
+        let mut lines = BASE64.encode(&code);
         lines.insert(40, '\n');
         let keras3 = json!({"function": {"class_name": "__lambda__", "config": {"code": lines, "defaults": null}}});
         for config in [keras1, keras3] {
