@@ -57,8 +57,8 @@ pub struct ReplayMoment {
     pub turn_deg: f64,
     /// What the driver asked for, [-1, 1].
     pub steering: f64,
-    /// What would lead back to the path, [-1, 1]; NaN near the end of a session.
-    pub pursuit: f64,
+    /// What would lead back to the path, [-1, 1]; `None` near the end of a session, where no path lies ahead.
+    pub pursuit: Option<f64>,
     /// Speed, m/s.
     pub speed_mps: f64,
     /// Whether the car was just put back.
@@ -196,7 +196,7 @@ fn drive_session(
             offset_m: offset.right_m,
             turn_deg: offset.turn.to_degrees(),
             steering,
-            pursuit: path.pursuit(geometry, pose, at_m, ahead_m).map_or(f64::NAN, |s| s.clamp(-1.0, 1.0)),
+            pursuit: path.pursuit(geometry, pose, at_m, ahead_m).map(|s| s.clamp(-1.0, 1.0)),
             speed_mps,
             put_back: std::mem::take(&mut put_back),
         };
@@ -287,7 +287,7 @@ pub fn moments_csv(run: &ReplayRun) -> String {
         String::from("time_s,row,x_m,y_m,heading_deg,along_m,offset_m,turn_deg,steering,pursuit,speed_mps,put_back\n");
     for m in &run.moments {
         text += &format!(
-            "{:.3},{},{:.4},{:.4},{:.3},{:.3},{:.4},{:.3},{:.6},{:.6},{:.3},{}\n",
+            "{:.3},{},{:.4},{:.4},{:.3},{:.3},{:.4},{:.3},{:.6},{},{:.3},{}\n",
             m.time_s,
             m.row,
             m.x_m,
@@ -297,7 +297,7 @@ pub fn moments_csv(run: &ReplayRun) -> String {
             m.offset_m,
             m.turn_deg,
             m.steering,
-            m.pursuit,
+            m.pursuit.map_or(String::new(), |steering| format!("{steering:.6}")),
             m.speed_mps,
             u8::from(m.put_back)
         );
