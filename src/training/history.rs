@@ -1,4 +1,4 @@
-//! What each epoch brought.
+//! The history of a run: one record for each epoch.
 
 use std::path::Path;
 
@@ -25,11 +25,11 @@ pub struct EpochRecord {
     pub relative_to_zero: Option<f64>,
     /// Learning rate of the last update.
     pub learning_rate: f64,
-    /// Training images.
+    /// Number of training images.
     pub images: usize,
-    /// Time the training batches took, without validation.
+    /// Time of the training batches without validation, seconds.
     pub train_seconds: f64,
-    /// Time of the whole epoch.
+    /// Time of the whole epoch, seconds.
     pub seconds: f64,
 }
 
@@ -38,7 +38,7 @@ pub struct EpochRecord {
 /// # Errors
 ///
 /// [`Error::Io`].
-pub fn write_history(path: &Path, history: &[EpochRecord]) -> Result<()> {
+pub(super) fn write_history(path: &Path, history: &[EpochRecord]) -> Result<()> {
     let mut writer = csv::Writer::from_writer(Vec::new());
     for record in history {
         writer.serialize(record).map_err(|e| Error::data(path, e.to_string()))?;
