@@ -111,8 +111,7 @@ fn the_command_tells_writes_and_refuses() {
     let dir = scratch.path();
     record(dir);
     let told = |threads: &str, out: &str| {
-        let mut report =
-            json(dir, &["drive", "zero", "--on", "drive", "--threads", threads, "--out", out, "--json"]);
+        let mut report = json(dir, &["drive", "zero", "--on", "drive", "--threads", threads, "--out", out, "--json"]);
         report.as_object_mut().unwrap().remove("frames_per_second");
         (report, std::fs::read_to_string(dir.join(out).join("session_1.csv")).unwrap())
     };

@@ -116,7 +116,7 @@ fn drive_on(log: &ReplayLog, options: &ReplayOptions, name: &str, stop: &StopSig
         || {
             let mut pilot = pilot.clone();
             Ok(move |view: &RgbImage| match &mut pilot {
-                Some(pilot) => pilot.steer(view.height, view.width, &view.pixels),
+                Some(pilot) => pilot.steer(view.view()),
                 None => Ok(0.0),
             })
         },
