@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use serde::Serialize;
 
+use super::recording_args::RecordingArgs;
 use super::replay::{self, ReplayArgs};
 use super::share_bar::ShareBar;
 use super::video::tell_video;
@@ -41,6 +42,8 @@ pub struct DriveArgs {
     /// With --on: camera and car of the recording: udacity, udacity-straight, steersman or donkeycar [default: by its format]
     #[arg(long, value_name = "PRESET", requires = "on")]
     camera: Option<String>,
+    #[command(flatten)]
+    reading: RecordingArgs,
     /// Laps of each run
     #[arg(long, default_value_t = 1)]
     laps: usize,
@@ -109,6 +112,7 @@ pub fn run(args: DriveArgs) -> Result<()> {
             return replay::run(&ReplayArgs {
                 model: &args.model,
                 on,
+                reading: &args.reading,
                 against: args.against.as_deref(),
                 out: args.out.as_deref(),
                 camera: args.camera.as_deref(),

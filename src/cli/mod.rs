@@ -27,6 +27,7 @@ mod inspect;
 mod predict;
 mod progress;
 mod record;
+mod recording_args;
 mod replay;
 mod serve;
 mod share_bar;

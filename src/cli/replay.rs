@@ -5,9 +5,9 @@ use std::time::Instant;
 
 use serde::Serialize;
 
+use super::recording_args::RecordingArgs;
 use super::share_bar::ShareBar;
 use super::{pool, print, print_json, stop_on_ctrl_c};
-use crate::dataset;
 use crate::error::{Error, Result};
 use crate::files::atomic_file;
 use crate::files::new_folder::NewFolder;
@@ -26,6 +26,8 @@ pub struct ReplayArgs<'a> {
     pub model: &'a str,
     /// The recording.
     pub on: &'a Path,
+    /// How it is read.
+    pub reading: &'a RecordingArgs,
     /// A second model.
     pub against: Option<&'a str>,
     /// Folder for the trajectories.
@@ -59,7 +61,7 @@ struct Report<'a> {
 
 pub fn run(args: &ReplayArgs) -> Result<()> {
     let pool = pool(args.threads)?;
-    let recording = pool.install(|| dataset::load(args.on))?;
+    let recording = pool.install(|| args.reading.load(args.on))?;
     recording.require_usable()?;
     let entry = GeometryEntry { preset: args.camera.map(String::from), ..GeometryEntry::default() };
     let geometry = entry.resolve(usual_preset(&recording))?;

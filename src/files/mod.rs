@@ -2,4 +2,5 @@
 
 pub mod atomic_file;
 pub mod new_folder;
+pub mod tar_archive;
 pub mod zip_archive;

@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use crate::dataset::{Kind, Recording, View};
+use crate::dataset::{Recording, View};
 use crate::error::{Error, Result};
 use crate::geometry::{CarGeometry, DrivenPath, LookAhead};
 use crate::picture::RgbImage;
@@ -104,10 +104,7 @@ impl ReplayLog<'_> {
 
 /// The preset for recordings of this kind, for those that say nothing of their camera.
 pub fn usual_preset(recording: &Recording) -> &'static str {
-    match recording.kind {
-        Kind::Tub => "donkeycar",
-        _ => "udacity",
-    }
+    if recording.kind().contains("tub") { "donkeycar" } else { "udacity" }
 }
 
 /// The pictures of a recording, decoded when they are needed; the last one is kept.
@@ -127,15 +124,9 @@ impl Frames {
     pub fn get(&mut self, recording: &Recording, row: usize, camera: View) -> Result<&RgbImage> {
         if self.held != Some((row, camera)) {
             self.held = None;
-            let path = recording.image_path(row, camera).ok_or_else(|| {
-                let line = recording.rows[row].line;
-                Error::data(&recording.path, format!("line {line} has no {} image", camera.name()))
-            })?;
-            self.file.clear();
-            std::fs::File::open(&path)
-                .and_then(|mut file| std::io::Read::read_to_end(&mut file, &mut self.file))
-                .map_err(Error::io(&path))?;
-            decode_rgb(&self.file, &mut self.image).map_err(|message| Error::data(&path, message))?;
+            recording.read_picture(row, camera, &mut self.file)?;
+            let place = || recording.image_path(row, camera).unwrap_or_else(|| recording.path.clone());
+            decode_rgb(&self.file, &mut self.image).map_err(|message| Error::data(place(), message))?;
             self.held = Some((row, camera));
         }
         Ok(&self.image)
