@@ -5,23 +5,24 @@ use serde::Serialize;
 /// A label counts as straight below this wheel angle, in degrees.
 const STRAIGHT_DEG: f64 = 1.0;
 
-/// What the model says of one row, and what the driver did.
+/// Predicted and recorded steering of one row.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Prediction {
     /// Predicted steering.
     pub steering: f32,
     /// Recorded steering.
     pub label: f32,
-    /// Which unbroken drive the row belongs to.
+    /// Index of the session, an unbroken drive, that the row belongs to.
     pub session: usize,
     /// Time in seconds; only differences within a session count.
     pub time_s: f64,
 }
 
-/// How well predictions fit labels. Angles are wheel angles in degrees. A mean over nothing is absent.
+/// Measures of how well predictions fit labels. Angles are those of the front wheels, in degrees. A mean over nothing is
+/// `None`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Metrics {
-    /// How many rows.
+    /// Number of rows.
     pub rows: usize,
     /// Mean squared error, of the normalised steering.
     pub mse: f64,

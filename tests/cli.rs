@@ -47,6 +47,7 @@ fn train_evaluate_and_predict_fit_together() {
 
     let summary = String::from_utf8(run(dir, &["summary", model]).stdout).unwrap();
     assert!(summary.contains("Total params: 28,589"), "{summary}");
+    assert!(summary.starts_with(&format!("model {model}\nrecipe lenet: ")), "{summary}");
 }
 
 fn first_image(folder: &Path, camera: &str) -> String {
@@ -141,6 +142,22 @@ fn bad_input_is_an_error_with_place_and_remedy() {
     let runs = dir.join("runs");
     assert!(!runs.exists(), "a run that cannot begin leaves no folder behind");
     assert_eq!(fs::read_to_string(dir.join("log/driving_log.csv")).unwrap(), log, "recordings are only read");
+}
+
+#[test]
+fn the_help_of_every_command_has_an_example() {
+    let text = |args: &[&str]| String::from_utf8(run(Path::new("."), args).stdout).unwrap();
+    let help = text(&["--help"]);
+    let commands = help.lines().skip_while(|line| *line != "Commands:").skip(1).take_while(|line| !line.is_empty());
+    let commands: Vec<&str> = commands.filter_map(|line| line.split_whitespace().next()).collect();
+    assert!(commands.len() > 15, "{commands:?}");
+    for command in commands.into_iter().filter(|command| *command != "help") {
+        assert!(
+            text(&[command, "--help"]).contains(&format!("\n  steersman {command} ")) || command == "train",
+            "{command}"
+        );
+        assert!(text(&[command, "--help"]).contains("Example"), "{command}");
+    }
 }
 
 #[test]

@@ -94,6 +94,10 @@ fn a_run_has_its_report_also_after_resume_and_runs_compare() {
     assert_eq!(page(&dir.join("a/report.html")).1, 24);
 
     run(dir, &["drive", "a/last.safetensors", "--track", "lake", "--runs", "1", "--out", "a/drives/lake"]);
+    run(dir, &["train", "--resume", "a"]);
+    let (text, _) = page(&dir.join("a/report.html"));
+    let place = |part: &str| text.find(part).unwrap_or_else(|| panic!("{part}"));
+    assert!(place("On the road") < place("lake: autonomy") && place("lake: autonomy") < place("Learning curves"));
     run(dir, &["compare", "a", "b", "--out", "c.html"]);
     let (text, _) = page(&dir.join("c.html"));
     for part in ["optimizer.learning_rate", "autonomy", "from the line", "Validation MSE"] {
@@ -117,6 +121,8 @@ fn explain_writes_pictures_and_says_what_the_model_looks_at() {
     // The painted stripe is all there is to go by, and it stands on the road.
     assert_eq!(effect("mask-road")["passed"], true, "{found}");
     assert_eq!(effect("shift-right")["passed"], true, "{found}");
+    assert!(found["findings"][0]["text"].as_str().unwrap().contains("a wheel held straight"), "{found}");
+    assert!(found["mae_deg"].as_f64().unwrap() < found["straight_mae_deg"].as_f64().unwrap(), "{found}");
     let moved = |change: &str| effect(change)["mean_moved_deg"].as_f64().unwrap();
     assert!(moved("mask-road") > 2.0 * moved("mask-bonnet"), "{found}");
     for file in found["pictures_written"].as_array().unwrap() {

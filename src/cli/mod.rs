@@ -28,15 +28,18 @@ mod predict;
 mod progress;
 mod record;
 mod recording_args;
+mod replay;
 mod serve;
 mod share_bar;
 mod sim;
 mod summary;
+mod terminal;
 mod tracks;
 mod train;
 mod video;
+mod words;
 
-use std::io::{ErrorKind, Write};
+use std::io::{ErrorKind, IsTerminal, Write};
 use std::path::Path;
 use std::process::ExitCode;
 use std::time::Instant;
@@ -60,22 +63,69 @@ struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
+    #[command(
+        after_help = "Examples:\n  steersman train\n      the whole job: record the expert, train, drive\n  steersman train data/sample --recipe lenet --set epochs=3\n      a recording of your own"
+    )]
     Train(train::TrainArgs),
+    #[command(
+        after_help = "Examples:\n  steersman record --track lake --out recordings/lake\n      the expert drives a lap\n  steersman record --track lake --manual --out recordings/mine\n      you drive, in the browser"
+    )]
     Record(record::RecordArgs),
+    #[command(
+        after_help = "Examples:\n  steersman drive runs/default-1/model.safetensors --track coast\n      how well it drives, in figures\n  steersman drive runs/default-1/model.safetensors --track coast --watch\n      the same, to look at in the browser"
+    )]
     Drive(drive::DriveArgs),
+    #[command(
+        after_help = "Example:\n  steersman serve runs/default-1/model.safetensors\n      for Udacity's simulator in autonomous mode"
+    )]
     Serve(serve::ServeArgs),
+    #[command(
+        after_help = "Example:\n  steersman sim --track lake\n      the simulator for a server of your own, on port 4567"
+    )]
     Sim(sim::SimArgs),
+    #[command(
+        after_help = "Example:\n  steersman evaluate runs/default-1/model.safetensors data/sample\n      error in degrees, beside a straight wheel"
+    )]
     Evaluate(evaluate::EvaluateArgs),
+    #[command(after_help = "Example:\n  steersman experiment --help\n      see the experiments and their options")]
     Experiment(experiment::ExperimentArgs),
+    #[command(
+        after_help = "Example:\n  steersman predict runs/default-1/model.safetensors frame.jpg\n      one angle for each image"
+    )]
     Predict(predict::PredictArgs),
+    #[command(
+        after_help = "Examples:\n  steersman export runs/default-1/model.safetensors --to onnx model.onnx\n      for ONNX Runtime\n  steersman export runs/default-1/model.safetensors --to c model.c\n      for a microcontroller"
+    )]
     Export(export::ExportArgs),
+    #[command(
+        after_help = "Example:\n  steersman inspect data/sample --out inspection\n      what is in it, and a page with pictures"
+    )]
     Inspect(inspect::InspectArgs),
+    #[command(after_help = "Example:\n  steersman tracks\n      the tracks there are")]
     Tracks(tracks::TracksArgs),
+    #[command(
+        after_help = "Examples:\n  steersman video data/sample sample.mp4 --model runs/default-1/model.safetensors\n      a recording, with the model beside the driver\n  steersman video runs/default-1/drives/lake lake.mp4\n      a saved drive"
+    )]
     Video(video::VideoArgs),
+    #[command(
+        after_help = "Examples:\n  steersman explain runs/default-1/model.safetensors --track lake --out explained\n      on what the expert sees\n  steersman explain runs/default-1/model.safetensors data/sample --out explained\n      on a recording"
+    )]
     Explain(explain::ExplainArgs),
+    #[command(
+        after_help = "Example:\n  steersman compare runs/default-1 runs/lenet-1 --out compared.html\n      two runs on one page"
+    )]
     Compare(compare::CompareArgs),
+    #[command(
+        after_help = "Examples:\n  steersman summary --recipe pilotnet\n      the layers of a recipe\n  steersman summary runs/default-1/model.safetensors\n      those of a model, and how it was trained"
+    )]
     Summary(summary::SummaryArgs),
+    #[command(
+        after_help = "Examples:\n  steersman bench --recipe lenet\n      images a second\n  steersman bench --recipe default --profile\n      where a training step spends its time"
+    )]
     Bench(bench::BenchArgs),
+    #[command(
+        after_help = "Example:\n  steersman import model.h5 --fit data/sample --out imported.safetensors\n      a model of Keras, with the preprocessing that fits a recording"
+    )]
     Import(import::ImportArgs),
 }
 
@@ -186,14 +236,17 @@ fn new_folder(path: &Path) -> Result<()> {
 }
 
 /// Prints a line to `out`, as [`println`] does.
-fn print_line(mut out: impl Write, text: &str) {
+fn print_line(mut out: impl Write + IsTerminal + terminal::Columns, text: &str) {
+    let text = terminal::fitted(&escaped_lines(text), &out);
     // A stream that is closed takes no complaint either.
-    let _ = writeln!(out, "{}", escaped_lines(text));
+    let _ = writeln!(out, "{text}");
 }
 
 /// Prints `text`. Whoever reads may stop before the end, as `head` does.
 fn print(text: &str) -> Result<()> {
-    match std::io::stdout().lock().write_all(escaped_lines(text).as_bytes()) {
+    let stdout = std::io::stdout();
+    let text = terminal::fitted(&escaped_lines(text), &stdout);
+    match stdout.lock().write_all(text.as_bytes()) {
         Err(e) if e.kind() != ErrorKind::BrokenPipe => Err(Error::io("standard output")(e)),
         _ => Ok(()),
     }
@@ -202,7 +255,10 @@ fn print(text: &str) -> Result<()> {
 /// Prints one JSON value as the last line.
 fn print_json(value: &impl Serialize) -> Result<()> {
     let text = serde_json::to_string(value).map_err(|e| Error::Fault(format!("cannot be written as JSON: {e}")))?;
-    print(&(escaped_json(&text) + "\n"))
+    match std::io::stdout().lock().write_all((escaped_json(&text) + "\n").as_bytes()) {
+        Err(e) if e.kind() != ErrorKind::BrokenPipe => Err(Error::io("standard output")(e)),
+        _ => Ok(()),
+    }
 }
 
 /// A number with `decimals`, or a dash where there is none.

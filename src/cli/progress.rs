@@ -7,6 +7,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use super::or_dash;
 use super::share_bar::ShareBar;
+use super::words::duration;
 use crate::error::Result;
 use crate::main_job::job::JobEvent;
 use crate::observer::{Observer, StopSignal};
@@ -31,12 +32,15 @@ pub struct TrainingDisplay {
     batch_losses: Vec<f64>,
     /// Of the epochs that are done: training and validation loss.
     losses: [Vec<f64>; 2],
+    /// Images a second, and seconds of validation, of the epoch before.
+    last_rate: Option<f64>,
+    validation_s: f64,
 }
 
 impl TrainingDisplay {
     /// For a run that is about to begin.
     pub fn new() -> TrainingDisplay {
-        let style = "epoch {prefix} [{bar:30}] {pos}/{len} images, {eta} left, {msg}";
+        let style = "epoch {prefix} [{bar:16}] {msg}";
         let style = ProgressStyle::with_template(style).expect("the template is valid").progress_chars("=> ");
         let bar = std::io::stderr().is_terminal().then(|| ProgressBar::new(0).with_style(style));
         let now = Instant::now();
@@ -48,6 +52,15 @@ impl TrainingDisplay {
             last_line: now,
             batch_losses: Vec::new(),
             losses: Default::default(),
+            last_rate: None,
+            validation_s: 0.0,
+        }
+    }
+
+    /// Takes the bar off the terminal, so that what is printed next stays.
+    pub fn finish(&mut self) {
+        if let Some(bar) = &self.bar {
+            bar.finish_and_clear();
         }
     }
 
@@ -75,7 +88,7 @@ impl Observer<TrainingEvent> for TrainingDisplay {
     fn observe(&mut self, event: TrainingEvent) -> Result<()> {
         match event {
             TrainingEvent::Notice(text) => self.print(&text),
-            TrainingEvent::Batch { epoch, images, of, loss } => self.batch(epoch, images, of, loss),
+            TrainingEvent::Batch { epoch, epochs, images, of, loss } => self.batch([epoch, epochs], images, of, loss),
             TrainingEvent::Epoch { record, of } => self.epoch(&record, of),
         }
         Ok(())
@@ -83,41 +96,46 @@ impl Observer<TrainingEvent> for TrainingDisplay {
 }
 
 impl TrainingDisplay {
-    fn batch(&mut self, epoch: u32, images: usize, of: usize, loss: f64) {
+    /// A batch of `epoch` of `epochs` is done; `images` of the epoch's `of` images were seen.
+    fn batch(&mut self, [epoch, epochs]: [u32; 2], images: usize, of: usize, loss: f64) {
         if epoch != self.epoch {
             (self.epoch, self.epoch_started, self.images_before) = (epoch, Instant::now(), images);
             self.batch_losses.clear();
             if let Some(bar) = &self.bar {
-                bar.set_prefix(epoch.to_string());
+                bar.set_prefix(format!("{epoch}/{epochs}"));
                 bar.set_length(of as u64);
                 bar.reset();
             }
         }
-        // Until more than the first batch is done there is no rate.
+        // Until more than the first batch is done there is no rate but that of the epoch before.
         let rate = (images - self.images_before) as f64 / self.epoch_started.elapsed().as_secs_f64().max(1e-9);
-        let rate = Some(rate).filter(|rate| *rate > 0.0);
+        let rate = Some(rate).filter(|rate| *rate > 0.0).or(self.last_rate);
+        let epochs_left = (epochs - epoch) as usize;
+        let validations_s = (epochs_left + 1) as f64 * self.validation_s;
+        let left = rate.map(|rate| duration((of - images + epochs_left * of) as f64 / rate + validations_s));
+        let left = left.map_or(String::new(), |left| format!(", {left} left"));
+        let rate = rate.map_or(String::new(), |rate| format!(", {rate:.0} images/s"));
         match &self.bar {
             Some(bar) => {
                 self.batch_losses.push(loss);
-                if self.last_line.elapsed() >= CURVE_INTERVAL {
+                // The first line says at once what is known.
+                if self.last_line.elapsed() >= CURVE_INTERVAL || self.batch_losses.len() == 2 {
                     self.last_line = Instant::now();
-                    bar.set_message(format!("{} images/s{}", or_dash(rate, 0), self.curves()));
+                    bar.set_message(format!("{images}/{of} images{rate}{left}{}", self.curves()));
                 }
                 bar.set_position(images as u64);
             }
             None if self.last_line.elapsed() >= PLAIN_INTERVAL => {
                 self.last_line = Instant::now();
-                let estimate = rate.map_or(String::new(), |rate| {
-                    let left = (of - images) as f64 / rate;
-                    format!(", {rate:.0} images/s, {left:.0} s left in this epoch")
-                });
-                eprintln!("epoch {epoch}: {images}/{of} images{estimate}");
+                eprintln!("epoch {epoch}/{epochs}: {images}/{of} images{rate}{left}");
             }
             None => {}
         }
     }
 
     fn epoch(&mut self, record: &EpochRecord, of: u32) {
+        self.last_rate = Some(record.images as f64 / record.train_seconds.max(1e-9));
+        self.validation_s = (record.seconds - record.train_seconds).max(0.0);
         self.losses[0].push(record.train_loss);
         self.losses[1].extend(record.val_mse);
         if let Some(bar) = &self.bar {
@@ -135,10 +153,8 @@ impl TrainingDisplay {
             record.images as f64 / record.train_seconds,
             record.seconds,
         ));
-        if record.epoch == of
-            && let Some(bar) = &self.bar
-        {
-            bar.finish_and_clear();
+        if record.epoch == of {
+            self.finish();
         }
     }
 }
@@ -154,6 +170,12 @@ impl JobDisplay {
     /// For a job that is about to begin, which `stop` ends.
     pub fn new(stop: &StopSignal) -> JobDisplay {
         JobDisplay { training: TrainingDisplay::new(), bar: None, stop: stop.clone() }
+    }
+
+    /// As [`TrainingDisplay::finish`].
+    pub fn finish(&mut self) {
+        self.bar = None;
+        self.training.finish();
     }
 }
 

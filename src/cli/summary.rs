@@ -6,7 +6,8 @@ use clap::Args;
 use serde::Serialize;
 use steersman_kernels::Isa;
 
-use super::{RecipeArgs, print, print_json, refuse_existing};
+use super::words::counted;
+use super::{RecipeArgs, or_dash, print, print_json, refuse_existing};
 use crate::engine::network::{NamedLayer, Network};
 use crate::error::Result;
 use crate::files::atomic_file;
@@ -76,7 +77,7 @@ pub fn run(args: SummaryArgs) -> Result<()> {
     let recipe = match &args.model {
         Some(path) => {
             let model = Model::load(path)?;
-            heading = format!("{}: recipe {}, {}\n", path.display(), model.recipe.name, training_line(&model));
+            heading = format!("model {}\n{}", path.display(), about(&model));
             model.recipe
         }
         None => args.recipe.find()?,
@@ -92,20 +93,25 @@ pub fn run(args: SummaryArgs) -> Result<()> {
     if args.json {
         return print_json(&Table::of(&recipe, &network));
     }
-    print(&format!("{heading}{}: {}\n\n{}", recipe.name, recipe.about, network.summary()))
+    if heading.is_empty() {
+        heading = format!("{}: {}\n", recipe.name, recipe.about);
+    }
+    print(&format!("{heading}\n{}", network.summary()))
 }
 
-fn training_line(model: &Model) -> String {
-    let record = &model.record;
-    if record.epochs == 0 && record.recordings.is_empty() {
-        return "not trained here".into();
-    }
-    format!(
-        "{} epochs on {} (seed {}, {}), validation MSE {}",
-        record.epochs,
-        record.recordings.join(", "),
-        record.seed,
-        record.isa,
-        super::or_dash(record.val_mse, 4)
-    )
+/// Recipe and training of a model, a line each.
+fn about(model: &Model) -> String {
+    let (record, recipe) = (&model.record, &model.recipe);
+    let trained = if record.epochs == 0 && record.recordings.is_empty() {
+        "not here".into()
+    } else {
+        let on = match &record.recordings[..] {
+            [only] => only.clone(),
+            several => counted(several.len(), "recording"),
+        };
+        let (epochs, seed, isa) = (counted(record.epochs as usize, "epoch"), record.seed, &record.isa);
+        format!("{epochs} on {on}, seed {seed}, {isa}")
+    };
+    let error = or_dash(record.val_mse, 4);
+    format!("recipe {}: {}\ntrained {trained}\nvalidation MSE {error}\n", recipe.name, recipe.about)
 }

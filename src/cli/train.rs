@@ -4,17 +4,27 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use clap::Args;
+use steersman_kernels::Isa;
 use steersman_kernels::conv::ConvAlgorithm;
 
 use super::progress::{JobDisplay, TrainingDisplay};
 use super::recording_args::RecordingArgs;
+use super::words::counted;
 use super::{RecipeArgs, or_dash, pool, print_json, stop_on_ctrl_c};
 use crate::dataset::held_out::{self, trained_on_held_out};
 use crate::error::{Error, Result};
 use crate::main_job::job::{Job, JobNote, JobRequest, Scope};
 use crate::main_job::{MainJobResult, TrackResult};
+use crate::recipe::Recipe;
 use crate::report;
 use crate::training::{self, RunFolder, TrainRequest, TrainResult, TransferRequest};
+
+/// Time of one core (Zen 3, 2.4 GHz) for recording and for driving, s.
+const SIMULATOR_CORE_S: f64 = 160.0;
+/// The same for training the default recipe.
+const TRAINING_CORE_S: f64 = 180.0;
+/// Reading and changing an image takes as long as this many multiply-adds.
+const IMAGE_MULTIPLY_ADDS: f64 = 1.5e6;
 
 /// Train a network on recordings
 #[derive(Debug, Args)]
@@ -92,18 +102,23 @@ pub fn run(args: TrainArgs) -> Result<()> {
     };
     if let Some(note) = note {
         let mut display = JobDisplay::new(&stop);
-        let mut job = Job::new(Scope::default(), note, &mut display, &stop).with_profile(args.profile);
+        let scope = Scope::default();
+        let mut job = Job::new(scope.clone(), note, &mut display, &stop).with_profile(args.profile);
         let result = match args.resume {
             Some(folder) => pool.install(|| job.go_on(&folder)),
             None => {
                 let recipe = recipe()?;
                 let out = args.out.unwrap_or_else(|| RunFolder::next_free(&recipe.name));
+                eprintln!("{}", plan(&recipe, &scope, args.dagger, pool.current_num_threads())?);
                 let (seed, cache_mib, algorithm) = (args.seed, args.cache, args.algorithm);
                 let request = JobRequest { recipe, out, seed, cache_mib, from, algorithm };
                 pool.install(|| job.begin(request))
             }
         };
         let folder = job.folder().map(Path::to_path_buf);
+        drop(job);
+        // The bar would take the lines below it along.
+        display.finish();
         let result = pool.install(|| explain_stop(result, folder.as_deref()))?;
         if let Some(folder) = folder {
             pool.install(|| write_report(&folder));
@@ -150,6 +165,7 @@ pub fn run(args: TrainArgs) -> Result<()> {
             (out, result)
         }
     };
+    display.finish();
     let result = pool.install(|| explain_stop(result, Some(&folder)))?;
     pool.install(|| write_report(&folder));
     if args.json {
@@ -157,6 +173,31 @@ pub fn run(args: TrainArgs) -> Result<()> {
     }
     print_training(&result);
     Ok(())
+}
+
+/// What the main job is going to do, and about how long it takes on `threads` threads.
+fn plan(recipe: &Recipe, scope: &Scope, dagger_rounds: u32, threads: usize) -> Result<String> {
+    let work = |recipe: &Recipe| -> Result<f64> {
+        let multiply_adds = recipe.network(Isa::best())?.multiply_adds() as f64;
+        Ok(f64::from(recipe.epochs) * (multiply_adds + IMAGE_MULTIPLY_ADDS))
+    };
+    let relative = work(recipe)? / work(&Recipe::find("default", &[])?)?;
+    let trainings = f64::from(dagger_rounds + 1);
+    let minutes = (SIMULATOR_CORE_S + trainings * relative * TRAINING_CORE_S) / 60.0 / threads as f64;
+    let about = if minutes < 1.5 { "a minute".into() } else { format!("{minutes:.0} minutes") };
+    let rounds = match dagger_rounds {
+        0 => String::new(),
+        rounds => format!(", lets the model drive and learn from it {}", counted(rounds as usize, "time")),
+    };
+    Ok(format!(
+        "records {} of the simulator's expert if they are not there, trains {} for {}{rounds}, then drives on {}: about {about} \
+         with {}; Ctrl-C stops and saves",
+        counted(scope.takes.len(), "drive"),
+        recipe.name,
+        counted(recipe.epochs as usize, "epoch"),
+        counted(scope.tracks.len(), "track"),
+        counted(threads, "thread"),
+    ))
 }
 
 /// Writes the page of the finished run in `folder`. The run is saved; a page that cannot be written takes nothing from it.
@@ -197,9 +238,9 @@ fn print_training(result: &TrainResult) {
     let twins = result.near_twin_percent.unwrap_or(0.0);
     let leak = result.leak_percent.max(twins);
     println!(
-        "trained on {} images for {} epochs in {:.1} s ({:.0} images/s); {} validation images, leak {} %",
+        "trained on {} images for {} in {:.1} s ({:.0} images/s); {} validation images, leak {} %",
         result.train_images,
-        result.epochs,
+        counted(result.epochs as usize, "epoch"),
         result.seconds,
         result.images_per_second,
         result.val_images,

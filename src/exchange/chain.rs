@@ -1,4 +1,4 @@
-//! A network without its training: a chain of operations with their numbers.
+//! A trained network as a chain of operations with their weights; layers that act in training only are left out.
 
 use crate::engine::layers::ExportForm;
 use crate::engine::network::{NamedLayer, Network, Parameters};
@@ -17,7 +17,7 @@ pub(crate) struct ChainStep {
 }
 
 impl ChainStep {
-    /// How many weights or slopes it has.
+    /// Number of weights or slopes.
     pub fn weight_len(&self) -> usize {
         match &self.form {
             ExportForm::Conv { weight, .. } | ExportForm::Dense { weight, .. } => weight.len(),
@@ -34,7 +34,7 @@ impl ChainStep {
     }
 }
 
-/// The operations of `network` with `parameters`; layers that do nothing in evaluation are left out.
+/// The operations that `network` computes with `parameters`. Layers that do nothing in inference are left out.
 pub(crate) fn chain(network: &Network, parameters: &Parameters) -> Vec<ChainStep> {
     let step = |layer: &NamedLayer| {
         let (input, output) = (layer.layer.input(), layer.layer.output());
@@ -46,7 +46,7 @@ pub(crate) fn chain(network: &Network, parameters: &Parameters) -> Vec<ChainStep
     network.layers().iter().filter_map(step).collect()
 }
 
-/// Batch normalisation of evaluation is `x · scale + shift` in each channel.
+/// Scale and shift of each channel: batch normalisation in inference is `x · scale + shift`.
 pub(crate) fn scale_and_shift(
     gamma: &[f32],
     beta: &[f32],
@@ -62,8 +62,12 @@ pub(crate) fn scale_and_shift(
     ChannelAffine { scale, shift }
 }
 
-/// Refuses numbers that are not finite, which a file of an exported model could not say or would compute nonsense with: those
-/// that folding made, and the scales and shifts of the batch normalisation that is left, as the 32-bit numbers they become.
+/// Checks that all numbers are finite as 32-bit floats: weights after folding, and scales and shifts of the batch
+/// normalisation that was not folded. An exported file cannot hold other numbers, or would compute nonsense with them.
+///
+/// # Errors
+///
+/// [`Error::Network`] names the layer.
 pub(crate) fn check_finite(steps: &[ChainStep]) -> Result<()> {
     let all_finite = |values: &[f32]| values.iter().all(|value| value.is_finite());
     for ChainStep { name, form, .. } in steps {
@@ -98,7 +102,8 @@ pub(crate) struct ChannelAffine {
     pub shift: Vec<f64>,
 }
 
-/// Merges every batch normalisation that directly follows a convolution or dense layer into its weights; others stay.
+/// Folds each batch normalisation that directly follows a convolution or a dense layer into that layer's weights. Others
+/// stay.
 pub(crate) fn fold_batch_norm(chain: Vec<ChainStep>) -> Vec<ChainStep> {
     let mut folded: Vec<ChainStep> = Vec::with_capacity(chain.len());
     for step in chain {

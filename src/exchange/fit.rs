@@ -1,9 +1,9 @@
-//! Which preprocessing a network was trained with, found by trying: on a recording, the right one gives predictions that go
+//! Finds the preprocessing that a network was trained with: under the right one, its predictions on a recording correlate
 //! with the labels.
 //!
-//! A first round tries every colour space, crop and scaling on some frames; a second one looks at the best of them again, on
-//! more frames and with the other ways to resize. Frames with a turned wheel are preferred: on straight road every
-//! combination looks alike.
+//! The first round tries every colour space, crop and scaling on a few frames. The second round tries the best of these on
+//! more frames, and with the other resize methods. Both prefer frames of bends: on a straight road all combinations give
+//! nearly the same prediction.
 
 use std::path::Path;
 
@@ -21,7 +21,7 @@ use crate::error::{Error, Result};
 use crate::metrics::correlation;
 use crate::picture::RgbImage;
 
-/// Kept rows of Udacity's picture, in projects of the field.
+/// Rows of Udacity's picture that well-known projects keep: first and end.
 const CROPS: [[usize; 2]; 12] = [
     [0, 160],
     [30, 135],
@@ -37,7 +37,7 @@ const CROPS: [[usize; 2]; 12] = [
     [70, 135],
 ];
 
-/// Factor and offset from grey level to input.
+/// Factor and offset that turn a grey level into an input value.
 const SCALINGS: [(f64, f64); 4] = [(1.0, 0.0), (1.0 / 255.0, 0.0), (1.0 / 255.0, -0.5), (1.0 / 127.5, -1.0)];
 
 const COLOURS: [Colour; 7] =
@@ -45,16 +45,16 @@ const COLOURS: [Colour; 7] =
 
 const SINGLE_PLANES: [Colour; 2] = [Colour::Gray, Colour::Saturation];
 
-/// Frames of the first and of the second round.
+/// Number of frames in the first and in the second round.
 const FRAMES: [usize; 2] = [96, 480];
 
-/// How many combinations the second round looks at.
+/// Number of combinations in the second round.
 const FINALISTS: usize = 12;
 
-/// A wheel turned by more than this steering counts as turned: one degree of 25.
+/// Steering from which a frame counts as a bend: one degree of 25.
 const TURNED: f32 = 0.04;
 
-/// A preprocessing and how well the network's predictions go with the labels under it.
+/// A preprocessing, and the correlation of the network's predictions with the labels under it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Candidate {
     /// The preprocessing.
@@ -71,8 +71,8 @@ pub struct Frames {
 }
 
 impl Frames {
-    /// Frames of the centre camera for both rounds, spread over the recording; two of three with a turned wheel, if there are
-    /// as many.
+    /// Picks frames of the centre camera for both rounds, spread over the recording. Two thirds of them are bends, if the
+    /// recording has that many.
     ///
     /// # Errors
     ///
@@ -103,12 +103,12 @@ impl Frames {
         Ok(Frames { images, labels })
     }
 
-    /// How many there are.
+    /// Number of frames.
     pub fn len(&self) -> usize {
         self.labels.len()
     }
 
-    /// Whether there are none.
+    /// Whether there is no frame.
     pub fn is_empty(&self) -> bool {
         self.labels.is_empty()
     }

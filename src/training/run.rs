@@ -62,6 +62,8 @@ pub enum TrainingEvent {
     Batch {
         /// Number of its epoch, from 1.
         epoch: u32,
+        /// Epochs in all, unless the run stops early.
+        epochs: u32,
         /// Images of the epoch that are done.
         images: usize,
         /// Images of the epoch in all.
@@ -430,6 +432,7 @@ impl TrainingRun {
             progress.train_seconds = seconds_of_epoch_before + started.elapsed().as_secs_f64();
             let observed = observer.observe(TrainingEvent::Batch {
                 epoch: epoch + 1,
+                epochs: self.recipe.epochs,
                 images: progress.images,
                 of: training.samples(),
                 loss: mean_loss,

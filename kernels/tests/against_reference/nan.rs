@@ -30,6 +30,7 @@ fn relu_makes_zero_of_nan_and_the_other_activations_pass_it_on() {
             ("leaky relu", apply(&|y| activation::leaky_relu_forward(isa, 0.1, &x, y))),
             ("tanh", apply(&|y| activation::tanh_forward(isa, &x, y))),
             ("softsign", apply(&|y| activation::softsign_forward(isa, &x, y))),
+            ("swish", apply(&|y| activation::swish_forward(isa, &x, y))),
             ("prelu", apply(&|y| activation::prelu_forward(isa, 1, &[0.1, 0.2], x.len() / 2, &x, y))),
         ] {
             let agree = x.iter().zip(&y).all(|(x, y)| x.is_nan() == y.is_nan());

@@ -44,7 +44,7 @@ impl BatchNorm {
         Ok(BatchNorm { shape, epsilon, running_old_weight, isa })
     }
 
-    /// The parts of what the barrier has found out.
+    /// `moments` by name.
     pub(crate) fn split<'a>(&self, moments: &'a [f32]) -> Moments<'a> {
         let mut parts = moments.chunks_exact(self.shape.c);
         let mut next = || parts.next().expect("moments have 7 values a channel");
@@ -61,7 +61,7 @@ impl BatchNorm {
 }
 
 impl BatchNorm {
-    /// Evaluation's `y = x · scale + shift`, from the running statistics; `scratch` has at least 2 c numbers.
+    /// Evaluation's `y = x · scale + shift`, from the running statistics; `scratch` has at least 2 c elements.
     pub(crate) fn scale_and_shift<'a>(
         &self,
         params: &[f32],
@@ -79,7 +79,7 @@ impl BatchNorm {
         (scale, shift)
     }
 
-    /// Adds the gradients of gamma and beta that follow from the sums of the backward pass.
+    /// Adds the gradients of beta (Σ dy) and gamma (Σ dy · x̂), the two halves of `sums`, to `dparams`.
     pub(crate) fn add_gradients(&self, sums: &[f64], dparams: &mut [f32]) {
         let c = self.shape.c;
         let (dgamma, dbeta) = dparams.split_at_mut(c);
@@ -90,7 +90,7 @@ impl BatchNorm {
     }
 }
 
-/// What the whole batch says of each channel; every slice has `[c]` numbers.
+/// Moments of each channel over the whole batch; every slice is `[c]`.
 #[derive(Clone, Copy)]
 pub(crate) struct Moments<'a> {
     pub mean: &'a [f32],
@@ -301,7 +301,7 @@ mod tests {
         let mut harness = Harness::new(&layer, 5);
         harness.params.copy_from_slice(&[2.0, 0.5, 0.25, -1.0]);
         for x in harness.x.iter_mut() {
-            *x = *x * 7.0 + 100.0; // far from zero: a careless variance loses its digits here
+            *x = *x * 7.0 + 100.0; // far from zero, where E[x²] − E[x]² cancels
         }
         harness.forward();
         for channel in 0..2 {

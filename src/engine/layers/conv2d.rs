@@ -11,15 +11,15 @@ use super::{
 };
 use crate::engine::tensor::{Fans, Initializer, Shape};
 
-/// What lies beyond the border of the image.
+/// What the kernel sees beyond the border of the map.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Padding {
     /// Nothing: the kernel stays inside the image; output size ⌊(size − kernel) / stride⌋ + 1.
     #[default]
     Valid,
-    /// Zeros, so that the output size is ⌈size / stride⌉; an odd number of zeros has the larger half below and to the right
-    /// (as in TensorFlow).
+    /// Zeros, so that the output size is ⌈size / stride⌉. If their number is odd, one more stands below and to the right than
+    /// above and to the left (as in TensorFlow).
     Same,
 }
 
@@ -57,7 +57,11 @@ pub struct Conv2d {
 }
 
 impl Conv2d {
-    /// A convolution of `filters` kernels of size `kernel` (height, width) over `input`, or what does not fit.
+    /// A convolution of `filters` kernels of size `kernel` (height, width) over `input`.
+    ///
+    /// # Errors
+    ///
+    /// A sentence that says what does not fit.
     pub fn new(
         input: Shape,
         filters: usize,
@@ -94,17 +98,17 @@ impl Conv2d {
         Ok(Conv2d { conv: Conv::new(shape, backend), shape, init })
     }
 
-    /// The kernel that computes it.
+    /// The convolution kernel.
     pub(crate) fn kernel(&self) -> &Conv {
         &self.conv
     }
 
-    /// Weight and bias.
+    /// `params` as weight and bias.
     pub(crate) fn split<'a>(&self, params: &'a [f32]) -> (&'a [f32], &'a [f32]) {
         params.split_at(self.weight_len())
     }
 
-    /// What is packed for the forward pass and for the input gradient, if anything is.
+    /// Packed weights of the forward pass and of the input gradient; `None` if nothing is packed.
     fn split_packed<'a>(&self, packed: &'a [f32]) -> Option<(&'a [f32], &'a [f32])> {
         (!packed.is_empty()).then(|| packed.split_at(self.conv.packed_len()))
     }

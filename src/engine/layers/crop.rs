@@ -1,4 +1,4 @@
-//! Cutting the border off inside the network.
+//! Cropping inside the network.
 
 use serde::{Deserialize, Serialize};
 use steersman_kernels::Backend;
@@ -37,7 +37,7 @@ impl Crop {
         Ok(Crop { input, output, top, left })
     }
 
-    /// Start of each kept row: in the input, in the output.
+    /// Index of the first value of each kept row, in the input and in the output.
     fn rows(&self, n: usize) -> impl Iterator<Item = (usize, usize)> {
         let (input, output, top, left) = (self.input, self.output, self.top, self.left);
         (0..n * output.c * output.h).map(move |row| {

@@ -14,8 +14,8 @@ use crate::engine::random::{Purpose, rng, shuffle, uniform};
 const STEP: f32 = 1e-3;
 const TOLERANCE: f64 = 2e-3;
 
-/// A layer with buffers of its own, run on one batch in one piece. For tests and for learning; networks plan their buffers
-/// instead.
+/// Runs a layer by itself on one batch, with buffers of its own. For tests and for learning: networks plan their buffers
+/// once for all layers.
 #[derive(Debug)]
 pub struct Harness<'a> {
     layer: &'a dyn Layer,
@@ -40,7 +40,8 @@ pub struct Harness<'a> {
 }
 
 impl<'a> Harness<'a> {
-    /// Buffers for `n` images, with an input and a `dy` of unit scale and parameters a little off their first values.
+    /// Buffers for `n` images. Input and `dy` have unit scale; parameters are first values plus noise, so that no scale is 1 and
+    /// no slope is 0.
     pub fn new(layer: &'a dyn Layer, n: usize) -> Harness<'a> {
         let mut random = rng(7, Purpose::Test, 0, 0);
         let (x_len, y_len) = (n * layer.input().len(), n * layer.output().len());
@@ -75,7 +76,7 @@ impl<'a> Harness<'a> {
         }
     }
 
-    /// Training pass forward: fills `y` and moves the running statistics.
+    /// Training pass forward: fills `y` and updates the running statistics.
     pub fn forward(&mut self) {
         if let Some(barrier) = self.layer.batch_statistics() {
             barrier.forward_sums(self.n, &self.x, &mut self.sums);
@@ -102,7 +103,7 @@ impl<'a> Harness<'a> {
         self.y.iter().zip(&self.dy).map(|(y, dy)| f64::from(*y) * f64::from(*dy)).sum()
     }
 
-    /// Central difference of the loss for each element of what `select` picks.
+    /// Central difference of the loss for each element of the buffer that `select` picks.
     fn numerical(&mut self, select: for<'b> fn(&'b mut Harness<'a>) -> &'b mut Vec<f32>) -> Vec<f64> {
         (0..select(self).len())
             .map(|i| {
@@ -142,13 +143,13 @@ pub fn check_layer(layer: &dyn Layer, n: usize) {
     }
 }
 
-/// Relative L2 distance of a gradient from its finite differences.
+/// Relative L2 distance between a gradient and its finite differences.
 pub fn relative_error(analytic: &[f32], numerical: &[f64]) -> f64 {
     assert_eq!(analytic.len(), numerical.len());
     let square = |values: &mut dyn Iterator<Item = f64>| values.map(|v| v * v).sum::<f64>();
     let distance = square(&mut analytic.iter().zip(numerical).map(|(a, b)| f64::from(*a) - b));
     let size = square(&mut analytic.iter().map(|a| f64::from(*a))).max(square(&mut numerical.iter().copied()));
-    // Where the true gradient vanishes (a batch of one number, normalised) only noise is left to compare.
+    // If the true gradient is 0 (batch norm of a single value), only rounding noise is compared; the bound keeps it from failing.
     (distance / size.max(1e-6 * analytic.len() as f64)).sqrt()
 }
 

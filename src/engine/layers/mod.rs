@@ -12,23 +12,25 @@
 //!
 //! # To add a layer
 //!
-//! [`Swish`] shows each place.
+//! Search the tree for `swish` to see each place.
 //!
-//! 1. **Kernel and reference**, if the layer computes something new: the loop in `kernels/src/` (`activation.rs`), the same as a
-//!    naive loop in double precision in `kernels/src/reference.rs`.
-//! 2. **Kernel test**: the two against each other, in `kernels/tests/against_reference/` (`elementwise.rs`).
-//! 3. **Layer**: a file of its own in this folder, with its `mod` and `pub use` lines. It holds the layer, which implements
-//!    [`Layer`]; its options, which implement [`LayerKind`] (what it is called, sees, and exports); and a gradient check
-//!    with [`gradcheck::check_layer`] (odd sizes, batch 1). Spoil a gradient on purpose and see the check fail.
-//! 4. **Spec entry**: one line in `network/spec.rs`, the `kind` of recipes with an example. The tests there hold each entry against
-//!    its layer by [`check_kind`].
+//! 1. **Kernel and reference**, if the layer computes something new: a fast loop in `kernels/src/` (as in `activation.rs`), and a
+//!    naive one in double precision in `kernels/src/reference.rs`.
+//! 2. **Kernel test**: the two loops against each other in `kernels/tests/against_reference/` (as in `elementwise.rs`).
+//! 3. **Layer**: a file in this folder, with its `mod` and `pub use` lines. It holds the layer, which implements [`Layer`]; its
+//!    options, which implement [`LayerKind`]: name, family, receptive field, checks, export form; and gradient checks with
+//!    [`gradcheck::check_layer`] (odd sizes, batch 1). Spoil a gradient on purpose and see the check fail.
+//! 4. **Spec entry**: one line in `network/spec.rs`, the `kind` of recipes with an example.
 //! 5. **Documentation**: the `layers` entry in `data/README.md`, and CHANGELOG.
-//! 6. If Keras has it, **the Keras reader**: an arm in `exchange/keras/translate.rs`.
+//! 6. **Keras reader**, if Keras has the layer: an arm in `exchange/keras/translate.rs`.
 //!
-//! Nothing else has to know. Recipes, summaries, model files and the optimizer go by [`ParamSpec`]; ONNX, C and Rust exports by
-//! [`ExportForm`]; saliency, feature maps and diagrams by [`ReceptiveField`] and [`Family`]; `benches/layers.rs` runs every spec
-//! entry. Forgetting 1 or 3 does not compile; forgetting 2, 4, 5 or an answer of [`LayerKind`] that is not true fails a test or leaves
-//! the layer without a name in recipes. `tests/new_layer.rs` follows this recipe outside the crate.
+//! Nothing else needs an edit. Recipes, summaries, model files and the optimizer go by [`ParamSpec`]; exports to ONNX, C and Rust
+//! by [`ExportForm`]; saliency, feature maps and diagrams by [`ReceptiveField`] and [`Family`]. The tests of `spec.rs`,
+//! `tests/export.rs` and `benches/layers.rs` take every spec entry.
+//!
+//! What happens if one is forgotten: without an answer of [`LayerKind`], or with a spec entry but no layer, nothing compiles. A
+//! wrong answer fails [`check_kind`], a missing entry in `data/README.md` a test of `spec.rs`. Without a spec entry, recipes do not
+//! know the layer. `tests/new_layer.rs` follows this recipe outside the crate.
 
 mod activation;
 mod batch_norm;

@@ -1,4 +1,4 @@
-//! Zeros around the border.
+//! Zero padding as a layer of its own.
 
 use serde::{Deserialize, Serialize};
 use steersman_kernels::Backend;
@@ -32,7 +32,7 @@ impl ZeroPad {
         ZeroPad { input, output: Shape::new(input.c, input.h + top + bottom, input.w + left + right), top, left }
     }
 
-    /// Start of each row of the input: in the input, in the output.
+    /// Index of the first value of each row of the input, in the input and in the output.
     fn rows(&self, n: usize) -> impl Iterator<Item = (usize, usize)> {
         let (input, output, top, left) = (self.input, self.output, self.top, self.left);
         (0..n * input.c * input.h).map(move |row| {

@@ -1,4 +1,4 @@
-//! The network as Keras wrote it down: JSON of many generations, read into a chain of layers.
+//! Reads the architecture that Keras saved, JSON of many versions, into a chain of layers.
 
 use std::collections::BTreeMap;
 
@@ -9,7 +9,7 @@ use super::messages::Problem;
 /// One layer of the chain.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct KerasLayer {
-    /// Its name, which the weights go by.
+    /// Its name, by which its weights are found.
     pub name: String,
     /// Its class, as in `Convolution2D`.
     pub class: String,
@@ -28,11 +28,11 @@ impl KerasLayer {
 #[derive(Debug)]
 pub(super) struct Chain {
     pub layers: Vec<KerasLayer>,
-    /// What makes them no chain; if there is anything, the layers are in the order of the file.
+    /// Reasons why the layers form no chain. If there are any, the layers stand in the order of the file.
     pub problems: Vec<Problem>,
 }
 
-/// Longer architectures are refused.
+/// Most layers of an architecture.
 const MAX_LAYERS: usize = 1000;
 
 /// The chain of layers in `text`.
@@ -42,7 +42,7 @@ const MAX_LAYERS: usize = 1000;
 ///
 /// # Errors
 ///
-/// A message if it is no architecture at all.
+/// A message that says why `text` is no architecture.
 pub(super) fn chain(text: &str) -> Result<Chain, String> {
     let mut value: Value = serde_json::from_str(text).map_err(|e| format!("its architecture is no JSON: {e}"))?;
     while let Value::String(inner) = value {
@@ -110,7 +110,7 @@ fn sources(call: &Value) -> Vec<String> {
     }
 }
 
-/// The places of a graph's layers in the order of its connections, if it is a chain.
+/// Indices of a graph's layers in the order of its connections, if the graph is a chain.
 fn order(nodes: &[Node]) -> Result<Vec<usize>, Vec<Problem>> {
     let mut problems = Vec::new();
     let mut readers: BTreeMap<&str, usize> = BTreeMap::new();

@@ -1,7 +1,7 @@
-//! From translated layers and their tensors to a network with parameters: shapes, and the order of the numbers.
+//! Assembles translated layers and their tensors into a network with parameters: checks shapes, and permutes weights.
 //!
-//! Keras (with TensorFlow's order of axes) keeps maps as height, width, channel, and its `Flatten` gives vectors in that order;
-//! here both are channel, height, width. Kernels and everything that comes after a flatten are permuted accordingly.
+//! Keras (with TensorFlow's order of axes) stores maps as height, width, channel, and its `Flatten` keeps that order. Here both
+//! are channel, height, width. Kernels, and weights of layers after a flatten, are permuted accordingly.
 
 use steersman_kernels::Isa;
 
@@ -17,7 +17,7 @@ use crate::engine::layers::{
 use crate::engine::network::{LayerSpec, Parameters};
 use crate::engine::tensor::{Initializer, Shape};
 
-/// Most numbers of an imported network: 256 MiB.
+/// Most parameters of an imported network: 256 MiB.
 const MAX_NUMBERS: usize = 1 << 26;
 
 /// Most slopes that are shared in the file and have to be repeated here: 16 MiB.
@@ -27,15 +27,15 @@ const MAX_REPEATED: usize = 1 << 22;
 pub(super) struct Assembly {
     pub specs: Vec<LayerSpec>,
     pub parameters: Parameters,
-    /// How many of `specs` stand for each Keras layer and those before it.
+    /// For each Keras layer, the number of `specs` that stand for it and for the layers before it.
     pub ends: Vec<usize>,
 }
 
-/// What holds for the whole file.
+/// Properties of the whole file.
 pub(super) struct Context {
     pub input: Shape,
     pub order: AxisOrder,
-    /// Kernels are turned by 180 degrees, as Theano's convolution did it.
+    /// Whether kernels are rotated by 180 degrees, as Theano's convolution needed them.
     pub flip_kernels: bool,
 }
 
@@ -75,7 +75,7 @@ struct Assembler<'a> {
     is_flat: bool,
     /// The map whose numbers the vector has, in the order height, width, channel.
     interleaved: Option<Shape>,
-    /// How many slopes have been repeated so far.
+    /// Number of slopes repeated so far.
     repeated: usize,
     specs: Vec<LayerSpec>,
     parameters: Parameters,
@@ -264,7 +264,7 @@ impl Assembler<'_> {
         }
     }
 
-    /// How far apart neighbours along channels, rows and columns lie in a tensor of extents `found`; 0 along a shared axis.
+    /// Strides along channels, rows and columns in a tensor of extents `found`; 0 along a shared axis.
     fn strides(&self, found: &[usize]) -> [usize; 3] {
         let [c, h, w] = self.extents(found);
         let steps = match self.context.order {
@@ -305,7 +305,7 @@ impl Assembler<'_> {
     }
 }
 
-/// For each number of a map in the order channel, row, column: its place in the order row, column, channel.
+/// For each element of a map in the order channel, row, column: its index in the order row, column, channel.
 fn interleaved_places(Shape { c, h, w }: Shape) -> Vec<usize> {
     (0..c * h * w).map(|i| (i % (h * w)) * c + i / (h * w)).collect()
 }

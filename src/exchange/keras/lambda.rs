@@ -1,8 +1,8 @@
 //! What a `Lambda` layer computes, found by reading its byte code; it is never executed.
 //!
-//! The functions of this field are all `x / a − b` in some spelling. The code is followed with symbols instead of numbers: on
-//! the stack lie constants and expressions `factor · x + offset`. Any instruction that leads away from these, or that is not
-//! known, makes the function unknown, and the user has to say what it computes.
+//! Lambda layers of steering networks compute `x / a − b` in some spelling. This module evaluates their code symbolically: the
+//! stack holds constants and expressions `factor · x + offset`. An instruction that is unknown, or that leaves this form,
+//! makes the function unknown; the user then has to say what it computes.
 
 use data_encoding::BASE64;
 use serde_json::Value;
@@ -16,7 +16,7 @@ pub(super) struct LambdaAffine {
     pub offset: f64,
 }
 
-/// The function in the configuration of a `Lambda` layer, or why it cannot be told.
+/// The function in the configuration of a `Lambda` layer, or the reason why it is unknown.
 pub(super) fn function(config: &serde_json::Map<String, Value>) -> Result<LambdaAffine, String> {
     let has_extras = |value: Option<&Value>| {
         value.is_some_and(|value| match value {
@@ -82,7 +82,7 @@ pub(super) fn affine(code: &[u8]) -> Option<LambdaAffine> {
     })
 }
 
-/// An instruction that matters here.
+/// An instruction that the evaluation knows.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Instruction {
     Argument,
@@ -99,7 +99,7 @@ enum Instruction {
     Return,
 }
 
-/// How instructions are written.
+/// Encoding of the instructions.
 #[derive(Clone, Copy, Debug)]
 enum Dialect {
     /// Up to Python 3.5: one byte, or three with an operand.
@@ -174,7 +174,7 @@ impl Dialect {
     }
 }
 
-/// What lies on the stack.
+/// An entry of the stack.
 #[derive(Clone, Copy, Debug)]
 enum Symbol {
     Number { value: f64, whole: bool },
@@ -184,7 +184,7 @@ enum Symbol {
 /// x itself.
 const ARGUMENT: Symbol = Symbol::Expression(LambdaAffine { factor: 1.0, offset: 0.0 });
 
-/// Follows the instructions; `None` if they compute anything but one expression in x.
+/// Evaluates the instructions; `None` if they compute anything but one expression in x.
 fn run(instructions: &[Instruction], constants: &[std::rc::Rc<Object>]) -> Option<LambdaAffine> {
     let mut stack = Vec::new();
     for (place, instruction) in instructions.iter().enumerate() {

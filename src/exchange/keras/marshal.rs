@@ -1,11 +1,11 @@
 //! Python's marshalled code objects, read as data.
 //!
 //! Keras stores a `Lambda` layer as the marshalled code of its Python function. The format has no version number and differs
-//! between Pythons ([`Layout`]); whoever reads tries one after the other. Nothing is ever executed.
+//! between Python versions ([`Layout`]); the caller tries one after the other. Nothing is ever executed.
 
 use std::rc::Rc;
 
-/// Nesting of a lambda's code is two or three deep; more is no lambda.
+/// Deepest nesting that is read. The code of a lambda is nested two or three deep.
 const MAX_DEPTH: usize = 32;
 
 /// Which Python wrote a code object.
@@ -43,7 +43,7 @@ impl Layout {
     }
 }
 
-/// A Python object, as far as arithmetic needs it.
+/// A Python object; only what arithmetic needs is told apart.
 #[derive(Debug)]
 pub(super) enum Object {
     Integer(i64),

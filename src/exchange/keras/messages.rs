@@ -25,7 +25,7 @@ pub(super) fn listed(problems: &[Problem]) -> String {
     text
 }
 
-/// Characters of a text from the file, and entries of a list of them, that messages show.
+/// Most characters of a text from the file that a message shows.
 const SHOWN_CHARS: usize = 100;
 const SHOWN_ENTRIES: usize = 20;
 

@@ -1,11 +1,10 @@
 //! Models that Keras saved: HDF5 of Keras 1 and 2, and the `.keras` archive of Keras 3.
 //!
-//! The way of a file: `file` opens it and finds architecture and weights; `architecture` reads the JSON into a chain of
-//! layers; `translate` says what each layer means here, `lambda` what a `Lambda` computes; `assemble` follows the shapes
-//! and brings the numbers into our order. Everything in a file is data and nothing in it is believed: what does not fit is an
-//! error that names the layer.
+//! `file` opens a file and finds architecture and weights. `architecture` reads the JSON into a chain of layers. `translate`
+//! finds the counterpart of each layer, `lambda` what a `Lambda` layer computes. `assemble` checks the shapes and permutes the
+//! weights. No code of a file is executed and no size in it is trusted; what does not fit is an error that names the layer.
 //!
-//! What a file does not say is how an image becomes the network's input: colour space, crop, and often the scaling.
+//! A file does not say how an image becomes the network's input: colour space, crop, and often the scaling.
 
 mod architecture;
 mod assemble;
@@ -36,15 +35,15 @@ use crate::error::{Error, Result};
 use crate::model_file::{Model, TrainingRecord};
 use crate::recipe::Recipe;
 
-/// What the user knows beside the file.
+/// What the user adds to the file.
 #[derive(Clone, Debug, Default)]
 pub struct ImportOptions {
-    /// The architecture's JSON, for files that hold weights only; taken before the one in the file.
+    /// Architecture as JSON, for files that hold weights only; it replaces the one in the file.
     pub architecture: Option<PathBuf>,
     /// What `Lambda` layers compute, by name: a and b of x / a − b.
     pub lambdas: BTreeMap<String, (f64, f64)>,
-    /// The weights were trained on Theano, whose convolution turned its kernels by 180 degrees. Files since Keras 2 say so
-    /// themselves.
+    /// Whether the weights were trained on Theano, whose convolution rotates its kernels by 180 degrees. Files since Keras 2
+    /// say so themselves.
     pub theano_kernels: bool,
     /// Shape of the input for files that leave it out.
     pub input: Option<Shape>,
@@ -57,7 +56,7 @@ pub struct Imported {
     pub input: Shape,
     /// The layers.
     pub layers: Vec<LayerSpec>,
-    /// Their numbers.
+    /// Their parameters.
     pub parameters: Parameters,
     /// Version of Keras that wrote the file, if it says.
     pub keras_version: Option<String>,

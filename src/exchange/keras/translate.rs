@@ -1,4 +1,4 @@
-//! What each Keras layer means here, from its options alone; shapes and weights come later.
+//! Translates each Keras layer by its options alone; `assemble` adds shapes and weights.
 
 use serde_json::{Map, Value};
 
@@ -21,7 +21,7 @@ pub(super) enum AxisOrder {
     ChannelsFirst,
 }
 
-/// How the numbers of a convolution's kernel lie in the file.
+/// Order of the axes of a convolution's kernel in the file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum KernelLayout {
     /// Height, width, inputs, outputs.
@@ -30,10 +30,10 @@ pub(super) enum KernelLayout {
     OutInHeightWidth,
 }
 
-/// What a layer does before its activation.
+/// The operation of a layer, without its activation.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum Operation {
-    /// Nothing that evaluation or training would see.
+    /// No operation.
     Nothing,
     /// The input; extents without the batch, if the file gives them.
     Input,
@@ -87,15 +87,15 @@ pub(super) struct KerasStep {
     pub order: Option<AxisOrder>,
     /// Extents of the input without the batch, in the order of the file, if the layer says; 0 where they are open.
     pub input: Option<Vec<usize>>,
-    /// What is lost, for the user.
+    /// A notice to the user about what the translation loses.
     pub notice: Option<&'static str>,
 }
 
-/// What `layer` means here; `known` is what the user says that it computes.
+/// Translates `layer`; `known` is the function that the user gave for it.
 ///
 /// # Errors
 ///
-/// Why it has no counterpart.
+/// The reason why the layer has no counterpart.
 pub(super) fn translate(layer: &KerasLayer, known: Option<LambdaAffine>) -> Result<KerasStep, String> {
     let options = Options(&layer.config);
     let mut notice = None;

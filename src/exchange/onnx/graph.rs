@@ -5,7 +5,7 @@ use super::proto::{
     TensorType, TypeProto, ValueInfoProto,
 };
 
-/// A graph that grows. Values are known by their names, which are unique.
+/// A graph under construction. Each value has a unique name.
 #[derive(Debug, Default)]
 pub struct GraphBuilder {
     graph: GraphProto,
@@ -42,7 +42,7 @@ impl GraphBuilder {
         self.constant(name, dims, DataType::Int32, values.iter().flat_map(|v| v.to_le_bytes()).collect())
     }
 
-    /// Adds a vector of 64-bit integers, as axes and indices are.
+    /// Adds a constant vector of 64-bit integers, the type of axes and indices.
     pub fn int64s(&mut self, name: &str, values: &[usize]) -> String {
         let raw_data = values.iter().flat_map(|v| (*v as i64).to_le_bytes()).collect();
         self.constant(name, &[values.len()], DataType::Int64, raw_data)
@@ -54,12 +54,12 @@ impl GraphBuilder {
         name.into()
     }
 
-    /// Names the value that goes in; the first axis is the batch and free.
+    /// Declares the graph's input; its first axis is the batch, of any size.
     pub fn input(&mut self, name: &str, data_type: DataType, image: &[usize], doc: &str) {
         self.graph.input.push(value_info(name, data_type, image, doc));
     }
 
-    /// Names the value that comes out; the first axis is the batch and free.
+    /// Declares the graph's output; its first axis is the batch, of any size.
     pub fn output(&mut self, name: &str, data_type: DataType, image: &[usize], doc: &str) {
         self.graph.output.push(value_info(name, data_type, image, doc));
     }
@@ -82,18 +82,18 @@ fn value_info(name: &str, data_type: DataType, image: &[usize], doc: &str) -> Va
     }
 }
 
-/// A node's integer.
+/// An integer attribute of a node.
 pub fn int(name: &str, value: i64) -> AttributeProto {
     AttributeProto { name: name.into(), i: Some(value), r#type: AttributeType::Int.into(), ..AttributeProto::default() }
 }
 
-/// A node's float.
+/// A float attribute of a node.
 pub fn float(name: &str, value: f32) -> AttributeProto {
     let r#type = AttributeType::Float.into();
     AttributeProto { name: name.into(), f: Some(value), r#type, ..AttributeProto::default() }
 }
 
-/// A node's list of integers.
+/// An attribute of a node that is a list of integers.
 pub fn ints(name: &str, values: &[usize]) -> AttributeProto {
     let ints = values.iter().map(|value| *value as i64).collect();
     AttributeProto { name: name.into(), ints, r#type: AttributeType::Ints.into(), ..AttributeProto::default() }

@@ -26,7 +26,7 @@ pub const OPSET: i64 = 17;
 /// Version of the file format that came with [`OPSET`].
 const IR_VERSION: i64 = 8;
 
-/// A protocol buffer must stay below 2 GiB; some bytes are left for what is no weight.
+/// Most bytes of weights. A protocol buffer must stay below 2 GiB; the rest is for names and shapes.
 const MAX_WEIGHT_BYTES: usize = (1 << 31) - (1 << 24);
 
 /// How to write an ONNX file.
@@ -42,7 +42,7 @@ pub struct OnnxOptions {
 ///
 /// # Errors
 ///
-/// [`Error::Network`] if the weights do not fit into a file of the format or are not finite, folded as asked for, naming the layer.
+/// [`Error::Network`] names a layer whose weights do not fit into an ONNX file, or are not finite after folding.
 pub fn onnx(model: &Model, options: OnnxOptions) -> Result<Vec<u8>> {
     let recipe = &model.recipe;
     let mut steps = chain(&recipe.network(Isa::PORTABLE)?, &model.parameters);
@@ -136,7 +136,7 @@ fn network(graph: &mut GraphBuilder, steps: &[ChainStep], input: &str, output: &
     graph.node("Identity", output, &[&value], vec![]);
 }
 
-/// Adds the nodes of one step; the name of its result.
+/// Adds the nodes of one step and returns the name of its result.
 fn operation(graph: &mut GraphBuilder, step: &ChainStep, x: &str, is_map: bool) -> String {
     let ChainStep { name, input, output, form } = step;
     let constant = |what: &str| format!("{name}.{what}");
@@ -192,8 +192,8 @@ fn operation(graph: &mut GraphBuilder, step: &ChainStep, x: &str, is_map: bool) 
     }
 }
 
-/// Adds the nodes of `formula` at `x`, the last of which is called `result`; the name of its result. Nodes and constants on the
-/// way are numbered behind the name of the layer.
+/// Adds the nodes that compute `formula` of `x`, and returns the name of the result, which is `result` for the last node. Other
+/// nodes and constants take the layer's name and a number.
 fn elementwise(
     graph: &mut GraphBuilder,
     layer: &str,

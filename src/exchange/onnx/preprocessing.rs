@@ -1,9 +1,9 @@
 //! Preprocessing as ONNX nodes that give the same grey levels as [`Preprocessor`](crate::dataset::preprocess::Preprocessor),
 //! to the bit.
 //!
-//! Between the nodes a picture is a map of floats `[N, c, h, w]` whose values are whole numbers from 0 to 255. What the engine
-//! computes in integers below 2²⁴ is exact in floats, whatever the order; larger integers are computed in 32-bit integers. The
-//! sums of the area method are added in the engine's order.
+//! Between nodes a picture is a float tensor `[N, c, h, w]` of whole numbers from 0 to 255. Floats hold integers below 2²⁴
+//! exactly, so the nodes compute these in floats and larger ones in 32-bit integers. The area method adds its sums in the
+//! engine's order.
 
 use super::graph::{GraphBuilder, int, ints};
 use super::proto::{AttributeProto, DataType};
@@ -71,13 +71,13 @@ impl Nodes<'_> {
         self.op_with("Cast", &[x], vec![int("to", data_type as i64)])
     }
 
-    /// `x` op a number.
+    /// Applies the operator `op` to `x` and a number.
     fn with(&mut self, op: &str, x: &str, value: f32) -> String {
         let value = self.number(value);
         self.op(op, &[x, &value])
     }
 
-    /// The rows or columns `positions` of `x`.
+    /// Gathers the rows or columns `positions` of `x`.
     fn gather(&mut self, x: &str, axis: i64, positions: &[usize]) -> String {
         let name = self.name();
         let positions = self.graph.int64s(&name, positions);
@@ -117,8 +117,8 @@ impl Nodes<'_> {
         self.op(op, &[x, &value])
     }
 
-    /// Between the two source positions of each tap, in 32-bit integers; each product divided by `divisor`. Nothing here is
-    /// negative, so the division rounds down.
+    /// Interpolates between the two source positions of each tap in 32-bit integers, and divides by `divisor`. All values are
+    /// positive, so the division rounds down.
     fn blend(&mut self, x: &str, axis: i64, taps: &[LinearTap], divisor: Option<i32>) -> String {
         let mut side = |position: fn(&LinearTap) -> usize, weight: fn(&LinearTap) -> i32| {
             let positions: Vec<usize> = taps.iter().map(position).collect();
@@ -136,8 +136,8 @@ impl Nodes<'_> {
         self.op("Add", &[&low, &high])
     }
 
-    /// The sum over the source positions that each output position covers, one after the other. Where one covers fewer than
-    /// others, it goes on with a weight of 0.
+    /// Sums the source positions that each output position covers, in their order. Where a position covers fewer than the
+    /// others, the missing ones have a weight of 0.
     fn weighted_sum(&mut self, x: &str, axis: i64, taps: &AreaTaps) -> String {
         let covered: Vec<(usize, &[f32])> = (0..taps.first.len()).map(|i| taps.of(i)).collect();
         let most = covered.iter().map(|(_, weights)| weights.len()).max().unwrap_or(0);
@@ -226,7 +226,7 @@ impl Nodes<'_> {
         Extremes { max, min, spread }
     }
 
-    /// What stands in `table` at each value of `x`.
+    /// Looks up each value of `x` in `table`.
     fn look_up(&mut self, table: &[i32], x: &str) -> String {
         let table: Vec<f32> = table.iter().map(|value| *value as f32).collect();
         let name = self.name();
@@ -249,7 +249,7 @@ impl Nodes<'_> {
         self.op("Where", &[&is_red, &red, &not_red])
     }
 
-    /// Adds `turn` to what is negative.
+    /// Adds `turn` to negative values.
     fn wrap(&mut self, angle: &str, turn: f32) -> String {
         let zero = self.number(0.0);
         let negative = self.op("Less", &[angle, &zero]);

@@ -1,8 +1,8 @@
-//! Source code with the weights in it, in C99 or Rust: one file that needs nothing else.
+//! A model as source code in C99 or Rust: one file with the weights in it that needs no other file.
 //!
-//! The file holds the preprocessing, the network and the buffers, so that memory is bounded and nothing is allocated. A model
-//! becomes a program, the same for both languages: arrays and calls of the functions in `library.c` or
-//! `library.rs`, of which the file gets those that it calls. Batch normalisation is folded into the layer before it.
+//! The file holds preprocessing, network and buffers; it allocates nothing. A model first becomes a `program` of arrays and
+//! calls, which is the same for both languages. The calls go to functions of `library.c` or `library.rs`; the file contains
+//! those that it calls. Batch normalisation is folded into the layer before it.
 
 mod c;
 mod program;
@@ -14,7 +14,7 @@ use super::chain::{chain, check_finite, fold_batch_norm};
 use crate::error::{Error, Result};
 use crate::model_file::Model;
 
-/// A language that models are written in.
+/// Language of the source file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Language {
     /// C99 without warnings under `-Wall -Wextra -pedantic`.
@@ -23,15 +23,14 @@ pub enum Language {
     Rust,
 }
 
-/// Most numbers of a layer; a source file has about 12 characters for each, and compilers take long over larger ones.
+/// Most weights of a layer. A source file takes about 12 characters for each, and compilers take long over larger files.
 const MAX_NUMBERS: usize = 1 << 22;
 
 /// `model` as one source file.
 ///
 /// # Errors
 ///
-/// [`Error::Network`] names a layer with more weights than a source file can sensibly hold, or with numbers that are not finite
-/// once batch normalisation is folded in.
+/// [`Error::Network`] names a layer with more than 2²² weights, or with weights that are not finite after folding.
 pub fn source(model: &Model, language: Language) -> Result<String> {
     let steps = fold_batch_norm(chain(&model.recipe.network(Isa::PORTABLE)?, &model.parameters));
     check_finite(&steps)?;

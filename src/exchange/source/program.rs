@@ -1,4 +1,4 @@
-//! A model as arrays, buffers and calls, before it is written in a language.
+//! A model as arrays, buffers and calls, independent of the language that it will be written in.
 
 use std::ops::Range;
 
@@ -9,7 +9,7 @@ use crate::engine::tensor::Shape;
 use crate::exchange::chain::{ChainStep, ChannelAffine, scale_and_shift};
 use crate::recipe::Recipe;
 
-/// Everything that the file of a model says.
+/// Content of the source file of a model.
 pub struct Program<'a> {
     pub recipe: &'a Recipe,
     /// Arrays that functions of the library read by their names.
@@ -22,7 +22,7 @@ pub struct Program<'a> {
     pub arrays: Vec<Array>,
     pub buffers: Vec<(Buffer, usize)>,
     pub statements: Vec<Statement>,
-    /// Where the steering stands in the end.
+    /// The buffer that holds the steering at the end.
     pub result: Buffer,
 }
 
@@ -67,12 +67,12 @@ impl Buffer {
 pub enum Statement {
     /// Calls a function of the library.
     Call {
-        /// What it is for, where that is not the same as for the call before.
+        /// Comment above the call; `None` if it continues the work of the call before.
         comment: Option<String>,
         function: &'static str,
         args: Vec<Arg>,
     },
-    /// Puts the formula of each of the first `len` numbers of a buffer in its place.
+    /// Replaces each of the first `len` numbers of a buffer by the formula of it.
     Map { comment: String, buffer: Buffer, len: usize, formula: Formula },
 }
 
@@ -204,7 +204,7 @@ impl<'a> Program<'a> {
         }
     }
 
-    /// From the camera image to the network's input in buffer `a`.
+    /// Adds the calls that turn the camera image into the network's input in buffer `a`.
     fn preprocess(&mut self) {
         let spec = &self.recipe.preprocessing;
         let ([first, end], width) = (spec.rows, spec.source[1]);
@@ -246,7 +246,7 @@ impl<'a> Program<'a> {
         self.call(None, "to_input", vec![at, Arg::Write(Buffer::A, 0), Arg::Int(len), factor, offset]);
     }
 
-    /// Whether there was anything to resize. The arrays of several calls are the same.
+    /// Adds the calls that resize; `false` if there is nothing to resize. Several calls share their arrays.
     fn resize(&mut self, src: Arg, dst: Arg, from: [usize; 2], channels: usize, comment: Option<String>) -> bool {
         let spec = &self.recipe.preprocessing;
         let resizer = Resizer::new(from, spec.resize, channels, spec.interpolation);
@@ -284,7 +284,7 @@ impl<'a> Program<'a> {
         true
     }
 
-    /// Converts `[h][w][3]` to planes in `buffer`.
+    /// Adds the call that converts `[h][w][3]` to planes in `buffer`.
     fn colour(&mut self, colour: Colour, src: Arg, buffer: Buffer, [h, w]: [usize; 2], comment: Option<String>) {
         let mut table = |name: &str, values| self.tables.push(Array { name: name.into(), values });
         let convert = match colour {

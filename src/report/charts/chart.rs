@@ -336,8 +336,8 @@ impl PixelMap {
             let spread = if axis.range.is_none() { (high / low).powf(0.05) } else { 1.0 };
             (low, high) = (low / spread, high * spread);
         } else {
-            if high - low < 1e-12 * low.abs().max(1e-6) {
-                let half = (0.1 * low.abs()).max(0.5);
+            if high - low <= 1e-9 * low.abs() {
+                let half = if low == 0.0 { 0.5 } else { 0.5 * low.abs() };
                 (low, high) = (low - half, high + half);
             }
             if round && axis.range.is_none() {
@@ -378,13 +378,17 @@ impl PixelMap {
                 let decades = f64::from(last - first);
                 let steps: &[f64] = if decades <= 3.0 { &[1.0, 2.0, 5.0] } else { &[1.0] };
                 let values = (first..=last).flat_map(|power| steps.iter().map(move |s| s * 10f64.powi(power)));
-                let inside = values.filter(|v| (self.low * 0.999..=self.high * 1.001).contains(v));
+                let inside: Vec<f64> = values.filter(|v| (self.low * 0.999..=self.high * 1.001).contains(v)).collect();
+                if inside.len() < 3 {
+                    let even = PixelMap { scale: Scale::Linear, ..*self };
+                    return even.ticks(count).into_iter().filter(|(value, _)| *value > 0.0).collect();
+                }
                 let label = |v: f64| match v {
                     v if !(1e-4..1e5).contains(&v) => format!("{v:.0e}"),
                     v if v >= 1.0 => format!("{v:.0}"),
                     v => format!("{v:.*}", (-v.log10() - 1e-9).ceil() as usize),
                 };
-                inside.map(|v| (v, label(v))).collect()
+                inside.into_iter().map(|v| (v, label(v))).collect()
             }
         }
     }
@@ -431,6 +435,7 @@ mod tests {
         assert_eq!(labels(-1.0, 1.0, Scale::Linear, 5.0), ["-1.0", "-0.5", "0.0", "0.5", "1.0"]);
         assert_eq!(labels(0.0, 30.0, Scale::Linear, 3.0), ["0", "10", "20", "30"]);
         assert_eq!(labels(0.011, 0.3, Scale::Log, 5.0), ["0.02", "0.05", "0.1", "0.2"]);
+        assert_eq!(labels(0.021, 0.045, Scale::Log, 5.0), ["0.025", "0.030", "0.035", "0.040", "0.045"]);
         assert_eq!(labels(1e-5, 0.02, Scale::Log, 5.0), ["1e-5", "0.0001", "0.001", "0.01"]);
     }
 
@@ -443,6 +448,8 @@ mod tests {
         assert!((log.place(0.1) - 50.0).abs() < 1e-9 && log.place(0.0).is_nan());
         let rounded = PixelMap::new(&Axis::new("y"), [0.3, 9.4].into_iter(), [0.0, 1.0], true);
         assert_eq!((rounded.low, rounded.high), (0.0, 10.0));
+        let constant = PixelMap::new(&Axis::new("rate"), [0.001, 0.001].into_iter(), [0.0, 1.0], true);
+        assert!(constant.low >= 0.0 && constant.high < 0.003, "{} {}", constant.low, constant.high);
     }
 
     #[test]

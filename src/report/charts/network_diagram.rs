@@ -1,4 +1,5 @@
-//! The diagram of a network: one block for each layer that changes the shape, with what is done to its output written below.
+//! The diagram of a network: a block for each layer that changes the shape; the layers after it that keep the shape are
+//! listed below the block.
 
 use super::chart::NARROW;
 use super::palette::{BLUE, GREEN, INK, ORANGE, PALE, QUIET_INK};
@@ -18,7 +19,7 @@ const LINE: f64 = 16.0;
 /// Largest front of a block.
 const LARGEST: f64 = 76.0;
 
-/// A layer that changes the shape, and those after it that do not.
+/// A layer that changes the shape, and the layers after it that keep it.
 struct LayerGroup {
     name: String,
     colour: &'static str,
@@ -126,7 +127,7 @@ fn draw_at(network: &Network, title: &str, width: f64) -> String {
     svg.finish()
 }
 
-/// The largest sizes of a network, which blocks are drawn in relation to.
+/// The largest sizes in a network; blocks are drawn relative to them.
 struct Sizes {
     side: f64,
     channels: f64,

@@ -4,10 +4,10 @@ use crate::dataset::Recording;
 use crate::report::charts::chart::{Axis, Chart, Mark};
 use crate::report::charts::palette;
 
-/// Bins of a histogram of labels in [-1, 1]; the middle one is centred at 0.
+/// Number of bins of a histogram of labels in [-1, 1]; the middle bin is centred at 0.
 const BINS: usize = 41;
 
-/// Seconds of driving up to each row: sessions stand one after the other, a second apart.
+/// Driving time at each row, s. Sessions follow each other with one second between them.
 pub fn driven_times(recording: &Recording) -> Vec<f64> {
     let mut times = vec![0.0; recording.rows.len()];
     let mut begin = 0.0;

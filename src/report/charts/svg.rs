@@ -5,7 +5,7 @@ use std::fmt::Write as _;
 use super::palette::{GROUND, INK};
 use crate::text::escaped_lines;
 
-/// Fonts every system has one of.
+/// Fonts, of which every system has one.
 pub const FONT: &str = "system-ui, -apple-system, 'Segoe UI', 'DejaVu Sans', Arial, sans-serif";
 
 /// Which point of a text its position names.
@@ -143,12 +143,12 @@ pub fn wrapped(text: &str, size: f64, width: f64) -> Vec<String> {
     lines
 }
 
-/// Width in pixels of `text` at `size`, by the mean width of a letter; good enough to leave room for it.
+/// Estimated width of `text` at `size`, pixels, from the mean width of a letter.
 pub fn text_width(text: &str, size: f64) -> f64 {
     0.56 * size * text.chars().count() as f64
 }
 
-/// At most two decimals, none that say nothing.
+/// `value` with at most two decimals and no trailing zeros.
 fn number(value: f64) -> String {
     let text = format!("{value:.2}");
     let text = text.trim_end_matches('0').trim_end_matches('.');

@@ -56,7 +56,7 @@ pub fn findings(effects: &[Effect], spread_deg: f64, baseline: Option<Baseline>,
                 Tone::Warning,
                 format!(
                     "On these pictures the model is off by {model:.2}° on average, {compared}: it is of no use here. Train it \
-                     longer, or on recordings like these; what it looks at matters only then."
+                     longer, or on recordings like these, before you look at what moves its angle."
                 ),
             );
         }
@@ -89,6 +89,9 @@ pub fn findings(effects: &[Effect], spread_deg: f64, baseline: Option<Baseline>,
     } else {
         // A model that is of no use steers by the road wrongly; that is no good news.
         say(if useful { Tone::Good } else { Tone::Neutral }, format!("It steers by the road: {both}."));
+    }
+    if !useful && baseline.is_some_and(|errors| errors.model_mae_deg >= errors.straight_mae_deg) {
+        return found; // advice on details would not mend a model that has not learned
     }
     if failed(Change::MaskSky) || failed(Change::MaskBonnet) {
         say(Tone::Warning, about_crop(failed(Change::MaskSky), failed(Change::MaskBonnet), recipe));

@@ -1,4 +1,4 @@
-//! Pictures to look at with a model: image files, a recording, or what the expert sees on a track.
+//! The pictures that a model is examined with: image files, a recording, or a lap of the expert in the simulator.
 
 use std::path::{Path, PathBuf};
 
@@ -25,7 +25,7 @@ pub enum Footage {
     },
 }
 
-/// The buffers of a thread that takes pictures.
+/// Buffers for reading or rendering pictures; each thread has its own.
 #[derive(Default)]
 pub struct FootageBuffers {
     renderer: Renderer,
@@ -85,7 +85,7 @@ impl Footage {
         self.len() == 0
     }
 
-    /// What a person, or the expert, steers at picture `i`.
+    /// Steering of the recorded driver, or of the expert, at picture `i`.
     pub fn label(&self, i: usize) -> Option<f32> {
         match self {
             Footage::Files(files) => files[i].1,

@@ -1,4 +1,4 @@
-//! Which parts of the picture excite the network: VisualBackProp (Bojarski et al. 2016, arXiv 1611.05418), the method of
+//! Shows which parts of the picture excite the network: VisualBackProp (Bojarski et al. 2016, arXiv 1611.05418), the method of
 //! NVIDIA's "Explaining How a Deep Neural Network Trained with End-to-End Learning Steers a Car" (2017, arXiv 1704.07911).
 //!
 //! The feature maps of each convolution, after its activation, are averaged over the channels; what is negative counts as 0.
@@ -52,8 +52,7 @@ enum BackStep {
     Multiply(usize),
 }
 
-/// How a layer's output relates to its input along one axis: output `i` covers inputs `i * stride - before` and the `kernel`
-/// from there on.
+/// Receptive field of a layer along one axis: output `i` covers the `kernel` inputs from `i * stride - before` on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SpreadAxis {
     /// Inputs.
@@ -202,7 +201,7 @@ impl Saliency {
                 let upper = at(i, j) * (1.0 - u) + at(i, j + 1) * u;
                 let lower = at(i + 1, j) * (1.0 - u) + at(i + 1, j + 1) * u;
                 let value = upper * (1.0 - t) + lower * t;
-                let (share, colour) = (OPACITY * value.sqrt(), palette::saliency(f64::from(value)));
+                let (share, colour) = (OPACITY * value.powf(0.7), palette::saliency(f64::from(value)));
                 let [r, g, b] = image.pixel(row, column).map(f32::from);
                 let grey = DIMMED * (0.299 * r + 0.587 * g + 0.114 * b);
                 let mixed = |k: usize| grey * (1.0 - share) + f32::from(colour[k]) * share;

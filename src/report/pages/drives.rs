@@ -93,7 +93,7 @@ pub(super) fn times(count: usize) -> String {
 /// Adds the drives of one run to `page`: what they came to, their table, their maps.
 pub(super) fn describe(page: &mut Page, drives: &[DriveView]) {
     page.section("On the road");
-    for (held_out, tracks) in [(false, "tracks that it was trained on"), (true, "held-out tracks")] {
+    for (held_out, tracks) in [(false, "training tracks"), (true, "held-out tracks")] {
         let of: Vec<&DriveSummary> =
             drives.iter().map(|drive| &drive.summary).filter(|summary| summary.held_out == held_out).collect();
         if of.is_empty() {
@@ -103,10 +103,16 @@ pub(super) fn describe(page: &mut Page, drives: &[DriveView]) {
         let laps: usize = of.iter().map(|summary| summary.laps_total).sum();
         let put_back: usize = of.iter().map(|summary| summary.interventions).sum();
         let text = format!(
-            "On {tracks} the model completed {done} of {laps} laps without help; with help it was put back {}.",
+            "On {tracks} the model completed {done} of {laps} {} without help; with help it was put back {}.",
+            if laps == 1 { "lap" } else { "laps" },
             times(put_back)
         );
-        page.advice(&text, if done == laps { Tone::Good } else { Tone::Warning });
+        let tone = match (done == laps, put_back) {
+            (true, 0) => Tone::Good,
+            (true, _) => Tone::Neutral,
+            (false, _) => Tone::Warning,
+        };
+        page.advice(&text, tone);
     }
     page.table(&HEADERS, &drives.iter().map(DriveView::row).collect::<Vec<_>>());
     page.paragraph(

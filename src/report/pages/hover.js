@@ -34,22 +34,31 @@ for (const svg of document.querySelectorAll("svg[data-x]")) {
       const colour = mark.getAttribute("stroke") || mark.getAttribute("fill"), name = mark.dataset.name;
       if (!mark.matches(".bar")) return { name, colour, dots: mark.matches(".dots"), at: points(mark), values: null };
       const box = mark.getBBox();
-      return { name, colour, at: [[box.x + box.width / 2, box.y]], values: mark.dataset.at.split(" ").map(Number) };
+      return { name, colour, at: [[box.x + box.width / 2, box.y]], half: box.width / 2 + 1, values: mark.dataset.at.split(" ").map(Number) };
     });
   };
   const show = (px, py) => {
     read();
-    const near = [];
+    /* The place of the curves that is nearest to the pointer, and every value there; bars and dots under it. */
+    let place = null;
     for (const mark of marks) {
-      let best = null, distance = mark.dots ? 14 : mark.values ? 8 : 24;
+      if (mark.dots || mark.values) continue;
+      for (const at of mark.at) if (place === null || Math.abs(at[0] - px) < Math.abs(place - px)) place = at[0];
+    }
+    let near = [];
+    for (const mark of marks) {
+      let best = null, distance = mark.dots ? 14 : mark.values ? mark.half : 2;
       for (const at of mark.at) {
-        const apart = mark.dots ? Math.hypot(at[0] - px, at[1] - py) : Math.abs(at[0] - px);
-        if (apart < distance) [best, distance] = [at, apart];
+        const apart = mark.dots ? Math.hypot(at[0] - px, at[1] - py) : Math.abs(at[0] - (mark.values ? px : place));
+        if (apart <= distance) [best, distance] = [at, apart];
       }
       if (best) near.push({ mark, at: best });
     }
+    /* Among dots, lines are only an aid. */
+    if (near.some(({ mark }) => mark.dots)) near = near.filter(({ mark }) => mark.dots);
     if (!near.length) return hide();
-    const place = near[0].at[0], lines = [svg.dataset.xLabel + ": " + short(near[0].mark.values ? near[0].mark.values[0] : x(place))];
+    place = near[0].at[0];
+    const lines = [svg.dataset.xLabel + ": " + short(near[0].mark.values ? near[0].mark.values[0] : x(place))];
     for (const { mark, at } of near) lines.push((mark.name || svg.dataset.yLabel) + ": " + short(mark.values ? mark.values[1] : y(at[1])));
     tip.textContent = lines.join("\n");
     guide.replaceChildren();

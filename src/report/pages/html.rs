@@ -96,7 +96,11 @@ impl Page {
             for (column, cell) in row.iter().enumerate() {
                 // Short words stay whole, whatever the width.
                 let short = cell.chars().count() <= SHORT && numeric.get(column) != Some(&true);
-                let class = if short { " class=\"s\"" } else { class(column) };
+                let class = match cell.as_str() {
+                    "" | "-" => " class=\"s none\"",
+                    _ if short => " class=\"s\"",
+                    _ => class(column),
+                };
                 let header = headers.get(column).filter(|header| !header.is_empty());
                 let header = header.map_or(String::new(), |header| format!(" data-header=\"{}\"", escape(header)));
                 let _ = write!(self.body, "<td{class}{header}>{}</td>", escape(cell));

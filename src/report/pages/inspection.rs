@@ -183,7 +183,7 @@ fn labels(page: &mut Page, inspection: &Inspection) {
     }
 }
 
-/// The rows of the window, within a session, in which the label changes most.
+/// The rows of the [`WINDOW_S`] seconds within one session in which the label changes most.
 fn busiest_window(recording: &Recording, times: &[f64]) -> std::ops::Range<usize> {
     let mut best = (f64::NEG_INFINITY, 0..0);
     for session in &recording.sessions {
@@ -205,7 +205,7 @@ fn busiest_window(recording: &Recording, times: &[f64]) -> std::ops::Range<usize
     best.1
 }
 
-/// Rows at even places of the order of the labels: from hard left to hard right.
+/// `count` rows from hard left to hard right, evenly spaced in the order of their labels.
 fn from_left_to_right(recording: &Recording, count: usize) -> Vec<usize> {
     let mut rows: Vec<usize> = (0..recording.rows.len()).collect();
     rows.sort_by(|&a, &b| recording.rows[a].steering.total_cmp(&recording.rows[b].steering));

@@ -1,4 +1,4 @@
-//! The split of recordings into training and validation, to be looked at.
+//! Shows how recordings are split into training and validation.
 
 use super::html::Page;
 use crate::dataset::leak::LeakAudit;
@@ -11,14 +11,14 @@ use crate::report::charts::steering::driven_times;
 use crate::report::charts::svg::{Anchor, Svg, text_width};
 use crate::report::tone::Tone;
 
-/// Recordings drawn; the rest is counted.
+/// Most recordings that are drawn; the others are counted.
 const MAX_STRIPS: usize = 24;
 /// Width of the drawing, pixels.
 const WIDTH: f64 = 1120.0;
 /// Room for the name before a strip.
 const LEFT: f64 = 190.0;
 
-/// What becomes of a row.
+/// The use of a row.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum RowFate {
     Training,

@@ -1,5 +1,5 @@
-//! What a picture of a video looks like: the camera, below it who steers how, beside it the way on the map and the steering of
-//! the last seconds.
+//! Paints the frames of a video: the camera's picture, the angles below it, and beside it the trail on the map and the
+//! steering of the last seconds.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -74,9 +74,9 @@ pub struct Captions {
     pub title: String,
     /// What else to know, in one line.
     pub subtitle: String,
-    /// Who steers, or would steer, in the colour of models, if anybody; 6 letters fit.
+    /// Name of who steers, or would steer, drawn in the colour of models; at most 6 letters.
     pub model: Option<&'static str>,
-    /// Whose steering it is compared with; 6 letters fit.
+    /// Name of whose steering it is compared with; at most 6 letters.
     pub reference: &'static str,
 }
 
@@ -105,7 +105,7 @@ pub struct Painter {
     scales: FilmScales,
     /// Whether the camera's picture shows what excites the model.
     saliency: bool,
-    /// Everything that stays, with the way on the map.
+    /// Everything that stays from frame to frame, with the trail on the map.
     base: RgbImage,
     projection: Option<Projection>,
     last_place: Option<[f64; 2]>,
@@ -498,9 +498,12 @@ mod tests {
             let mut out = RgbImage::default();
             painter.notice(&shown);
             painter.paint(&shown, &mut out);
-            let newest =
-                (LONE_TRACE[0] as usize..LONE_TRACE[1] as usize).find(|y| out.pixel(*y, ASIDE[1] - 3) == MODEL);
-            heights.extend((k == 1 || k == 4).then_some(newest.unwrap()));
+            let apart = |y: &usize| -> u32 {
+                out.pixel(*y, ASIDE[1] - 3).iter().zip(MODEL).map(|(a, b)| u32::from(a.abs_diff(b))).sum()
+            };
+            let newest = (LONE_TRACE[0] as usize..LONE_TRACE[1] as usize).min_by_key(apart).unwrap();
+            assert!(k == 0 || apart(&newest) < 200, "the curve is drawn up to now");
+            heights.extend((k == 1 || k == 4).then_some(newest));
         }
         assert_eq!(heights[0], heights[1], "2 degrees stand where they stood before");
         let scales = FilmScales::covering([3.0, -7.0].into_iter(), [0.1, 0.3].into_iter());

@@ -1,4 +1,4 @@
-//! Real time: moments become pictures at an even rate, repeated or left out as their times demand.
+//! Turns moments at uneven times into pictures at an even rate: each moment stays until the next one begins.
 
 use std::path::Path;
 
@@ -7,10 +7,10 @@ use super::summary::VideoSummary;
 use crate::error::Result;
 use crate::picture::RgbImage;
 
-/// A video whose picture at each moment is the last that came before it, to half a picture's time.
+/// A video that shows at each time the last moment before it, to half a frame.
 pub(super) struct Timeline {
     file: VideoFile,
-    /// Painted and not yet written: how long it stays is known when the next one comes.
+    /// The last picture, painted and not yet written: only the next moment says how long it stays.
     picture: RgbImage,
     first_s: Option<f64>,
 }

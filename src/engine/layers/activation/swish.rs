@@ -90,3 +90,25 @@ impl LayerKind for SwishSpec {
         ExportForm::Elementwise(Formula::X * Function::Sigmoid.of(Formula::X))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::engine::layers::gradcheck::check_layer;
+
+    #[test]
+    fn gradients_hold() {
+        for isa in Isa::available() {
+            for (n, shape) in [(1, Shape::vector(1)), (3, Shape::new(2, 5, 7)), (2, Shape::vector(37))] {
+                check_layer(&Swish::new(shape, isa), n);
+            }
+        }
+    }
+
+    #[test]
+    fn it_has_its_defined_values() {
+        let mut y = [f32::NAN; 4];
+        Swish::new(Shape::vector(4), Isa::best()).infer(&[], &[], 1, &[2.0, -2.0, 0.0, 40.0], &mut y, &mut []);
+        approx::assert_relative_eq!(y[..], [1.761_594_2, -0.238_405_84, 0.0, 40.0], max_relative = 2e-6);
+    }
+}
