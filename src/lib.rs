@@ -3,15 +3,23 @@
 //!
 //! # A tour
 //!
-//! A frame's way to the wheels: [`dataset`] reads a recording, splits it *before* anything is augmented, decodes each image
-//! once and preprocesses it; a [`recipe`] says how, and what network to train; [`network`](engine::network) plans the buffers of its
-//! [`layers`](engine::layers) and runs them; [`training`] goes through the epochs, follows the gradient with an [`optimizer`](engine::optimizer) and writes the
-//! run folder; [`model_file`] is what remains; a [`pilot`] loads it and steers. [`metrics`] measure how well it predicts,
-//! and [`simulator`] how well it drives; [`report`] shows both on pages and in films; [`live`] shows a drive in a browser, and lets a person drive there; [`exchange`] reads
-//! models of other programs and writes ours down for them. [`cli`] is the command line.
+//! | room | what happens there |
+//! |---|---|
+//! | [`dataset`] | reads a recording, splits it *before* anything is augmented, decodes each picture once and preprocesses it |
+//! | [`recipe`] | the experiment: preprocessing, network, samples, split, optimizer |
+//! | [`engine`] | [layers](engine::layers) with their backward passes, [networks](engine::network) and the plans that run them, the [optimizer](engine::optimizer) |
+//! | [`training`] | goes through the epochs and writes the run folder |
+//! | [`model_file`], [`pilot`] | what remains of a run; a model that steers |
+//! | [`metrics`], [`simulator`], [`replay`] | how well a model predicts; how well it drives on a track, and on a recording |
+//! | [`geometry`] | camera and car of a recording, the driven path, views from beside it |
+//! | [`report`], [`live`] | pages, pictures and films; a drive in the browser |
+//! | [`serve`], [`udacity`], [`simulator_client`] | drives Udacity's simulator; its messages; our simulator in its place |
+//! | [`exchange`] | models of other programs in, ours out for them |
+//! | [`main_job`], [`cli`] | what `train` does without a recording; the command line |
 //!
-//! Dependencies point one way: `steersman-kernels` (all vector code and every `unsafe` line) ← [`tensor`](engine::tensor) ← [`layers`](engine::layers) ←
-//! [`network`](engine::network) (with the [`loss`](engine::loss)) ← [`optimizer`](engine::optimizer) ← [`training`]; [`dataset`] and [`simulator`] know no network.
+//! Dependencies point one way, from the command line down to `steersman-kernels`, which holds all vector code and every `unsafe`
+//! line; `tests/rooms.rs` states the order and keeps it. Below the rooms of the table lie `error`, `text`, `observer`, `picture`,
+//! `files` and `net`, which any of them may use. The [glossary](#glossary) at the end explains the words.
 //!
 //! # Three promises
 //!
@@ -150,6 +158,7 @@
 //!
 //! check_layer(&Softplus { shape: Shape::new(2, 3, 5) }, 3);
 //! ```
+#![doc = include_str!("glossary.md")]
 #![forbid(unsafe_code)]
 
 #[cfg(feature = "cli")]
@@ -162,6 +171,8 @@ pub mod error;
 pub mod exchange;
 #[cfg(feature = "training")]
 pub mod files;
+#[cfg(feature = "training")]
+pub mod geometry;
 #[cfg(feature = "live")]
 pub mod live;
 #[cfg(feature = "cli")]
@@ -181,6 +192,8 @@ pub mod picture;
 pub mod pilot;
 #[cfg(feature = "training")]
 pub mod recipe;
+#[cfg(feature = "training")]
+pub mod replay;
 #[cfg(feature = "report")]
 pub mod report;
 #[cfg(feature = "serve")]

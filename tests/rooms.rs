@@ -5,7 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 /// The top-level rooms. A room may use those above it.
-const ROOMS: [&str; 26] = [
+const ROOMS: [&str; 28] = [
     "error",
     "suggestion",
     "text",
@@ -13,10 +13,12 @@ const ROOMS: [&str; 26] = [
     "metrics",
     "statistics",
     "picture",
+    "geometry",
     "files",
     "net",
     "engine",
     "dataset",
+    "replay",
     "udacity",
     "recipe",
     "model_file",

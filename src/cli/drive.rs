@@ -5,6 +5,8 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use serde::Serialize;
 
+use super::recording_args::RecordingArgs;
+use super::replay::{self, ReplayArgs};
 use super::share_bar::ShareBar;
 use super::video::tell_video;
 use super::{pool, print, print_json, stop_on_ctrl_c};
@@ -32,8 +34,16 @@ pub struct DriveArgs {
     /// Model file, or `expert`, or `zero` (never steers)
     model: String,
     /// lake, mountain, coast, forest, random:SEED, or a track file
-    #[arg(long)]
-    track: String,
+    #[arg(long, required_unless_present = "on")]
+    track: Option<String>,
+    /// Drive on the pictures of a recording instead of a track: the nearest one, warped to where the car is
+    #[arg(long, value_name = "RECORDING", conflicts_with_all = ["track", "watch", "video"])]
+    on: Option<PathBuf>,
+    /// With --on: camera and car of the recording: udacity, udacity-straight, steersman or donkeycar [default: by its format]
+    #[arg(long, value_name = "PRESET", requires = "on")]
+    camera: Option<String>,
+    #[command(flatten)]
+    reading: RecordingArgs,
     /// Laps of each run
     #[arg(long, default_value_t = 1)]
     laps: usize,
@@ -95,7 +105,23 @@ struct Report<'a> {
 }
 
 pub fn run(args: DriveArgs) -> Result<()> {
-    let track = Track::load(&args.track)?;
+    let track = match (&args.on, &args.track) {
+        (None, Some(track)) => Track::load(track)?,
+        (None, None) => return Err(Error::Usage("name a track with --track, or a recording with --on".into())),
+        (Some(on), _) => {
+            return replay::run(&ReplayArgs {
+                model: &args.model,
+                on,
+                reading: &args.reading,
+                against: args.against.as_deref(),
+                out: args.out.as_deref(),
+                camera: args.camera.as_deref(),
+                latency_ms: args.latency_ms,
+                threads: args.threads,
+                json: args.json,
+            });
+        }
+    };
     let options = DriveOptions {
         laps: args.laps,
         runs: args.runs,

@@ -13,9 +13,11 @@ use super::{or_dash, pool, print_json};
 use crate::dataset::held_out::trained_on_held_out;
 use crate::dataset::{Recording, View};
 use crate::error::{Error, Result};
+use crate::geometry::{GeometryEntry, LookAhead};
 use crate::metrics::{Metrics, Prediction};
 use crate::model_file::Model;
 use crate::pilot::Pilot;
+use crate::replay::{ReplayLog, usual_preset};
 
 /// Compare a model's steering with what was recorded: centre camera, every usable row
 #[derive(Debug, Args)]
@@ -27,6 +29,9 @@ pub struct EvaluateArgs {
     recordings: Vec<PathBuf>,
     #[command(flatten)]
     reading: RecordingArgs,
+    /// How far ahead the driven path is aimed at for the path_* measures, s
+    #[arg(long, default_value_t = 0.7, value_name = "S")]
+    look_ahead_s: f64,
     /// Threads; 0 is one for each core
     #[arg(long, default_value_t = 0)]
     threads: usize,
@@ -40,8 +45,28 @@ pub struct EvaluateArgs {
 struct Report<'a> {
     #[serde(flatten)]
     metrics: &'a Metrics,
+    #[serde(flatten)]
+    path: Option<PathReport>,
     #[serde(skip_serializing_if = "<[String]>::is_empty")]
     trained_on_held_out: &'a [String],
+}
+
+/// The same against the steering that follows the driven path; see [`crate::geometry::driven_path`].
+#[derive(Serialize)]
+struct PathReport {
+    /// How far ahead the path is aimed at, s; never nearer than two wheelbases.
+    path_look_ahead_s: f64,
+    /// Rows with a path label.
+    path_rows: usize,
+    /// Mean absolute error, in degrees of the front wheels.
+    path_mae_deg: f64,
+    /// Pearson's correlation of predictions and path labels.
+    path_correlation: Option<f64>,
+    /// Mean squared error ÷ mean squared path label.
+    path_relative_to_zero: Option<f64>,
+    /// Speed that was assumed where a recording says none, m/s.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    path_assumed_speed_mps: Option<f64>,
 }
 
 pub fn run(args: EvaluateArgs) -> Result<()> {
@@ -52,7 +77,10 @@ pub fn run(args: EvaluateArgs) -> Result<()> {
     let pilot = Pilot::new(model, Isa::best())?;
 
     let pool = pool(args.threads)?;
-    let mut predictions = Vec::new();
+    if !(0.0..=10.0).contains(&args.look_ahead_s) {
+        return Err(Error::Usage(format!("--look-ahead-s {}: 0 to 10 s can be looked ahead", args.look_ahead_s)));
+    }
+    let (mut predictions, mut path_predictions, mut assumed_mps) = (Vec::new(), Vec::new(), None);
     let (mut known, mut sessions_before) = (0, 0);
     for path in &args.reading.expand(args.recordings)? {
         let recording = pool.install(|| args.reading.load(path))?;
@@ -60,13 +88,29 @@ pub fn run(args: EvaluateArgs) -> Result<()> {
             eprintln!("{notice}");
         }
         known += (0..recording.rows.len()).filter(|row| trained_on.contains(&recording.row_id(*row))).count();
-        predictions.extend(pool.install(|| predict(&pilot, &recording, sessions_before)));
+        let geometry = GeometryEntry::default().resolve(usual_preset(&recording))?;
+        let look_ahead = LookAhead { seconds: args.look_ahead_s, ..LookAhead::usual(&geometry) };
+        let log = ReplayLog::of_any_length(&recording, geometry);
+        assumed_mps = assumed_mps.or(log.assumed_speed_mps);
+        let path_labels = log.path_labels(look_ahead);
+        for (row, prediction) in pool.install(|| predict(&pilot, &recording, sessions_before)) {
+            predictions.push(prediction);
+            path_predictions.extend(path_labels[row].map(|label| Prediction { label, ..prediction }));
+        }
         sessions_before += recording.sessions.len();
     }
     let metrics = Metrics::of(&predictions, full_lock_deg).ok_or_else(|| Error::Data {
         place: "the recordings".into(),
         message: "no row can be used; `steersman inspect` says why".into(),
     })?;
+    let path = Metrics::of(&path_predictions, full_lock_deg).map(|metrics| PathReport {
+        path_look_ahead_s: args.look_ahead_s,
+        path_rows: metrics.rows,
+        path_mae_deg: metrics.mae_deg,
+        path_correlation: metrics.correlation,
+        path_relative_to_zero: metrics.relative_to_zero,
+        path_assumed_speed_mps: assumed_mps,
+    });
     if known > 0 {
         eprintln!(
             "note: {known} of {} rows belong to the model's training split: this is no test of how well it generalises",
@@ -74,7 +118,7 @@ pub fn run(args: EvaluateArgs) -> Result<()> {
         );
     }
     if args.json {
-        return print_json(&Report { metrics: &metrics, trained_on_held_out: &held_out });
+        return print_json(&Report { metrics: &metrics, path, trained_on_held_out: &held_out });
     }
     if !held_out.is_empty() {
         println!("note: the model was {}", trained_on_held_out(&held_out));
@@ -94,11 +138,20 @@ pub fn run(args: EvaluateArgs) -> Result<()> {
     );
     println!("bias                       {:+.2} deg", metrics.bias_deg);
     println!("whiteness                  {} deg/s", or_dash(metrics.whiteness_deg_s, 1));
+    if let Some(path) = path {
+        println!("against the driven path    {} rows, {} s ahead", path.path_rows, path.path_look_ahead_s);
+        println!("  correlation              {}", or_dash(path.path_correlation, 3));
+        println!("  MSE / predicting zero    {}", or_dash(path.path_relative_to_zero, 3));
+        println!("  MAE                      {:.2} deg", path.path_mae_deg);
+        if let Some(mps) = path.path_assumed_speed_mps {
+            println!("  no speed was recorded; {mps:.1} m/s was assumed");
+        }
+    }
     Ok(())
 }
 
-/// Predictions for the centre images of all rows; images that cannot be decoded are reported and left out.
-fn predict(pilot: &Pilot, recording: &Recording, sessions_before: usize) -> Vec<Prediction> {
+/// Predictions for the centre images of all rows, each with its row; images that cannot be decoded are reported and left out.
+fn predict(pilot: &Pilot, recording: &Recording, sessions_before: usize) -> Vec<(usize, Prediction)> {
     let session_of = |row: usize| recording.sessions.partition_point(|session| session.end <= row);
     let predict_row = |pilot: &mut Pilot, row: usize| {
         let mut bytes = Vec::new();
@@ -106,12 +159,12 @@ fn predict(pilot: &Pilot, recording: &Recording, sessions_before: usize) -> Vec<
         let place = || recording.image_path(row, View::Centre).unwrap_or_default();
         let named = |error: Error| Error::data(place(), error.to_string());
         match read.and_then(|()| pilot.steer_encoded(&bytes).map_err(named)) {
-            Ok(steering) => Some(Prediction {
-                steering,
-                label: recording.rows[row].steering,
-                session: sessions_before + session_of(row),
-                time_s: recording.rows[row].time_ms as f64 / 1000.0,
-            }),
+            Ok(steering) => {
+                let label = recording.rows[row].steering;
+                let session = sessions_before + session_of(row);
+                let time_s = recording.rows[row].time_ms as f64 / 1000.0;
+                Some((row, Prediction { steering, label, session, time_s }))
+            }
             Err(error) => {
                 eprintln!("left out: {error}");
                 None

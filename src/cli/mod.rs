@@ -28,6 +28,7 @@ mod predict;
 mod progress;
 mod record;
 mod recording_args;
+mod replay;
 mod serve;
 mod share_bar;
 mod sim;

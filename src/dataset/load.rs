@@ -127,7 +127,12 @@ fn look_below(store: &Store, path: &Path, depth: usize, count: &mut usize, found
         }
         *count += 1;
         // A folder that cannot be read, or holds several logs, is for whoever names it.
-        let here = if archive { Store::of(&entry).and_then(|store| find(&store, &entry)) } else { find(store, &entry) };
+        let here = if archive {
+            Store::of(&entry)
+                .and_then(|store| find(&store, &entry)?.map_or_else(|| find_deeper(&store, &entry), Ok).map(Some))
+        } else {
+            find(store, &entry)
+        };
         match here {
             Ok(Some(_)) => found.push(entry),
             Ok(None) if depth < MAX_DEPTH && !archive => look_below(store, &entry, depth + 1, count, found)?,

@@ -130,7 +130,6 @@ pub fn split(
         SplitMode::RandomImages => split.by_images(recordings, samples, balance, seed),
     }
     if spec.mode == SplitMode::Blocks {
-        split.settle_copies(recordings);
         split.low_throttle_rows = [&mut split.training, &mut split.validation]
             .map(|side| drop_low_throttle(side, recordings, samples))
             .iter()
@@ -202,6 +201,8 @@ impl Split {
 
     fn by_blocks(&mut self, recordings: &[Recording], seed: u64) {
         let share = self.spec.validation_share;
+        let copies = Copies::of(recordings);
+        let mut runs_of_copies = Vec::new();
         let mut short = Vec::new();
         let mut number = 0;
         for (i, recording) in recordings.iter().enumerate() {
@@ -213,10 +214,14 @@ impl Split {
             }
             for session in &recording.sessions {
                 number += 1;
-                if recording.session_s(session) >= LONG_SESSION_S {
-                    self.cut(recording, i as u16, session, seed, number);
-                } else {
-                    short.push((i as u16, session.clone(), number));
+                let (own, runs) = copies.pieces(recording, i as u16, session);
+                runs_of_copies.extend(runs.into_iter().map(|run| (i as u16, run)));
+                for session in own {
+                    if recording.session_s(&session) >= LONG_SESSION_S {
+                        self.cut(recording, i as u16, &session, seed, number);
+                    } else {
+                        short.push((i as u16, session, number));
+                    }
                 }
             }
         }
@@ -251,6 +256,7 @@ impl Split {
         }
         self.training.sort_unstable();
         self.validation.sort_unstable();
+        self.settle_copies(&copies, &runs_of_copies);
     }
 
     /// Cuts validation blocks out of a session.
@@ -280,37 +286,30 @@ impl Split {
         }
     }
 
-    /// Rows that show the picture of an earlier row stay where that one stands, or are used on neither side: with a recording
-    /// that is there twice, each validation frame would stand on the training side too.
-    fn settle_copies(&mut self, recordings: &[Recording]) {
-        let mut first: HashMap<u64, (u16, u32)> = HashMap::new();
-        let mut copies: HashMap<(u16, u32), (u16, u32)> = HashMap::new();
-        for (i, recording) in recordings.iter().enumerate() {
-            for row in 0..recording.rows.len() {
-                let Some(hash) = recording.picture_hash(row) else { break };
-                let here = (i as u16, row as u32);
-                let earlier = *first.entry(hash).or_insert(here);
-                if earlier != here {
-                    copies.insert(here, earlier);
-                }
-            }
-        }
-        if copies.is_empty() {
+    /// Puts rows that show the picture of an earlier row on its side. Those of long runs of copies stand on no side yet; single
+    /// ones that stand on another side than their picture are used on neither: it never stands on both.
+    fn settle_copies(&mut self, copies: &Copies, runs: &[(u16, Range<usize>)]) {
+        if copies.0.is_empty() {
             return;
         }
-        let places =
-            |side: &[Item]| -> HashSet<(u16, u32)> { side.iter().map(|item| (item.recording, item.row)).collect() };
+        let places = |side: &[Item]| -> HashSet<Place> { side.iter().map(|item| (item.recording, item.row)).collect() };
         let sides = [places(&self.training), places(&self.validation)];
         let mut dropped = 0;
         for (side, places) in [&mut self.training, &mut self.validation].into_iter().zip(&sides) {
             let before = side.len();
-            side.retain(|item| copies.get(&(item.recording, item.row)).is_none_or(|earlier| places.contains(earlier)));
+            side.retain(|item| copies.first(item.recording, item.row).is_none_or(|first| places.contains(&first)));
             dropped += before - side.len();
+            let followers = runs.iter().flat_map(|(i, run)| rows_of(*i, run.clone()));
+            side.extend(
+                followers
+                    .filter(|item| copies.first(item.recording, item.row).is_some_and(|first| places.contains(&first))),
+            );
+            side.sort_unstable();
         }
         self.notices.push(format!(
-            "{} rows show the same picture as an earlier row (the log, or a recording, is there twice, or the car stands): {dropped} \
-             of them are used on neither side, so that no picture stands on both",
-            copies.len()
+            "{} rows show the same picture as an earlier row (the log, or a recording, is there twice, or the car stands): they \
+             stand on its side, {dropped} of them on neither",
+            copies.0.len()
         ));
     }
 
@@ -337,6 +336,59 @@ impl Split {
         let training = images.split_off((self.spec.validation_share * images.len() as f64).round() as usize);
         self.training = rows_of_images(training);
         self.validation = rows_of_images(images);
+    }
+}
+
+/// A row: number of its recording, and its own.
+type Place = (u16, u32);
+
+/// Rows that show the picture of an earlier row, byte for byte, each with the first such row.
+struct Copies(HashMap<Place, Place>);
+
+impl Copies {
+    /// Finds copies among the rows whose pictures were hashed.
+    fn of(recordings: &[Recording]) -> Copies {
+        let (mut first, mut copies) = (HashMap::new(), HashMap::new());
+        for (i, recording) in recordings.iter().enumerate() {
+            for row in 0..recording.rows.len() {
+                let Some(hash) = recording.picture_hash(row) else { break };
+                let here = (i as u16, row as u32);
+                let earlier = *first.entry(hash).or_insert(here);
+                if earlier != here {
+                    copies.insert(here, earlier);
+                }
+            }
+        }
+        Copies(copies)
+    }
+
+    /// The first row with the picture of a row, unless that is the first one itself.
+    fn first(&self, recording: u16, row: u32) -> Option<Place> {
+        self.0.get(&(recording, row)).copied()
+    }
+
+    /// Takes the runs of copies out of a session that last as long as a guard: what remains of it, and the runs.
+    fn pieces(&self, recording: &Recording, i: u16, session: &Range<usize>) -> (Vec<Range<usize>>, Vec<Range<usize>>) {
+        if self.0.is_empty() {
+            return (vec![session.clone()], Vec::new());
+        }
+        let (mut own, mut runs, mut begin) = (Vec::new(), Vec::new(), session.start);
+        let is_copy = |row: &usize| self.first(i, *row as u32).is_some();
+        let mut row = session.start;
+        while row < session.end {
+            let end = (row..session.end).find(|row| !is_copy(row)).unwrap_or(session.end);
+            let run = row..end;
+            let lasts_ms =
+                if run.is_empty() { 0 } else { recording.rows[end - 1].time_ms - recording.rows[row].time_ms };
+            if !run.is_empty() && (lasts_ms >= GUARD_MS || run == *session) {
+                own.extend((begin < row).then_some(begin..row));
+                runs.push(run);
+                begin = end;
+            }
+            row = end.max(row + 1);
+        }
+        own.extend((begin < session.end).then_some(begin..session.end));
+        (own, runs)
     }
 }
 

@@ -1,0 +1,306 @@
+//! Drives along the sessions of a recording, and what they came to.
+
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use super::log::{Frames, ReplayLog, ReplaySession};
+use crate::dataset::View;
+use crate::error::{Error, Result};
+use crate::geometry::{CarGeometry, LookAhead, Offset, PixelGrid, ViewWarp};
+use crate::picture::RgbImage;
+
+/// Frames that a driver sees in each second, as in the simulator.
+const DRIVE_HZ: f64 = 20.0;
+/// Distance from the path at which the car is put back, m (NVIDIA 2016).
+pub const MAX_OFFSET_M: f64 = 1.0;
+/// Turn from the path at which the car is put back, deg.
+pub const MAX_TURN_DEG: f64 = 15.0;
+/// Time charged for each time the car is put back, s (NVIDIA 2016).
+const INTERVENTION_S: f64 = 6.0;
+/// A car that stood in the recording rolls on at this speed, in wheelbases a second.
+const MIN_WHEELBASES_PER_S: f64 = 0.5;
+
+/// How a recording is driven on.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ReplayOptions {
+    /// Time from a picture to the wheels, ms, in steps of 50.
+    pub latency_ms: f64,
+    /// How far ahead the path is pursued by the steering that is shown beside the driver's.
+    pub look_ahead: LookAhead,
+}
+
+impl ReplayOptions {
+    /// No latency, and the usual look-ahead.
+    pub fn usual(geometry: &CarGeometry) -> ReplayOptions {
+        ReplayOptions { latency_ms: 0.0, look_ahead: LookAhead::usual(geometry) }
+    }
+}
+
+/// One moment of a drive on a recording.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct ReplayMoment {
+    /// Time since the start of the session, s.
+    pub time_s: f64,
+    /// Row of the recording whose picture was shown.
+    pub row: usize,
+    /// Place of the rear axle, m, in the coordinates of the session's path.
+    pub x_m: f64,
+    /// See `x_m`.
+    pub y_m: f64,
+    /// Where the car points, deg, anticlockwise from x.
+    pub heading_deg: f64,
+    /// Way along the path, m.
+    pub along_m: f64,
+    /// Distance from the path, m, + = right.
+    pub offset_m: f64,
+    /// Turn from the path, deg, + = right.
+    pub turn_deg: f64,
+    /// What the driver asked for, [-1, 1].
+    pub steering: f64,
+    /// What would lead back to the path, [-1, 1]; `None` near the end of a session, where no path lies ahead.
+    pub pursuit: Option<f64>,
+    /// Speed, m/s.
+    pub speed_mps: f64,
+    /// Whether the car was just put back.
+    pub put_back: bool,
+}
+
+/// What there is to see at one frame of a drive on a recording.
+#[derive(Debug)]
+pub struct ReplayFrame<'a> {
+    /// The warped picture, as the driver saw it.
+    pub view: &'a RgbImage,
+    /// The session that is driven.
+    pub session: &'a ReplaySession,
+    /// Where the car is, and how it is steered.
+    pub moment: ReplayMoment,
+}
+
+/// A drive along one session.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct ReplayRun {
+    /// Moments at 20 Hz.
+    pub moments: Vec<ReplayMoment>,
+    /// Times the car was put back.
+    pub interventions: usize,
+    /// Way along the path, m.
+    pub distance_m: f64,
+    /// Time, s.
+    pub time_s: f64,
+    /// Sum of squared changes of the wheels' angle, deg²/s.
+    pub whiteness_sum: f64,
+}
+
+impl ReplayRun {
+    /// Share of the time in which nobody had to help, %.
+    pub fn autonomy_percent(&self) -> f64 {
+        autonomy_percent(self.interventions, self.time_s)
+    }
+}
+
+fn autonomy_percent(interventions: usize, time_s: f64) -> f64 {
+    (100.0 * (1.0 - INTERVENTION_S * interventions as f64 / time_s.max(1e-9))).max(0.0)
+}
+
+/// The measures of a drive on a recording; the fields of `drive --on RECORDING --json`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ReplaySummary {
+    /// Sessions driven.
+    pub sessions: usize,
+    /// Share of the time in which nobody had to help, %: `(1 - 6 s * interventions / time) * 100`, not below 0.
+    pub autonomy_percent: f64,
+    /// Times the car was put back.
+    pub interventions: usize,
+    /// The same for each km.
+    pub interventions_per_km: f64,
+    /// Way along the path, m.
+    pub distance_m: f64,
+    /// Time, s.
+    pub time_s: f64,
+    /// Distance from the path: mean, m.
+    pub offset_mean_m: f64,
+    /// Its root mean square, m.
+    pub offset_rms_m: f64,
+    /// Its 95th percentile, m.
+    pub offset_p95_m: f64,
+    /// Root mean square rate of the steering, deg/s.
+    pub whiteness_deg_s: f64,
+    /// Frames shown.
+    pub frames: usize,
+    /// Frames a second; the one number that differs between runs.
+    pub frames_per_second: f64,
+}
+
+/// Drives along every session of `log`, sessions in parallel; results do not depend on the number of threads. `new_driver` makes
+/// a driver: steering in [-1, 1], + = right, for a picture. `seen` is shown every frame; an error of it ends the drive.
+///
+/// # Errors
+///
+/// Pictures that cannot be read, and the errors of drivers and of `seen`.
+pub fn replay<D>(
+    log: &ReplayLog,
+    options: &ReplayOptions,
+    new_driver: impl Fn() -> Result<D> + Sync,
+    seen: &(dyn Fn(usize, &ReplayFrame) -> Result<()> + Sync),
+) -> Result<Vec<ReplayRun>>
+where
+    D: FnMut(&RgbImage) -> Result<f32>,
+{
+    if !(0.0..=2000.0).contains(&options.latency_ms) {
+        return Err(Error::Usage(format!("latency {} ms: 0 to 2000 ms can be simulated", options.latency_ms)));
+    }
+    (log.sessions.par_iter().enumerate())
+        .map(|(number, session)| drive_session(log, session, options, new_driver()?, &|frame| seen(number, frame)))
+        .collect()
+}
+
+fn drive_session(
+    log: &ReplayLog,
+    session: &ReplaySession,
+    options: &ReplayOptions,
+    mut driver: impl FnMut(&RgbImage) -> Result<f32>,
+    seen: &dyn Fn(&ReplayFrame) -> Result<()>,
+) -> Result<ReplayRun> {
+    let ReplayLog { geometry, .. } = log;
+    let path = &session.path;
+    let mut run = ReplayRun::default();
+    let mut eye = Eye::default();
+    let Some(mut pose) = path.pose_at(0.0) else { return Ok(run) };
+    let mut at_m = 0.0;
+    let mut put_back = false;
+    let mut last_steering: Option<f64> = None;
+    let delay = (options.latency_ms / 1000.0 * DRIVE_HZ).round() as usize;
+    let mut on_the_way = std::collections::VecDeque::from(vec![0.0; delay]);
+    let dt_s = 1.0 / DRIVE_HZ;
+    while at_m < path.length_m() - 1e-6 {
+        let offset = path.pose_at(at_m).unwrap_or_default().offset_to(pose);
+        let row = nearest_row(session, at_m);
+        let speed_mps = session.speed_mps[row].max(MIN_WHEELBASES_PER_S * geometry.wheelbase_m);
+        let view = eye.look(log, session, row, session.path.poses()[row].offset_to(pose))?;
+        let steering = f64::from(driver(view)?);
+        let steering = if steering.is_finite() { steering.clamp(-1.0, 1.0) } else { 0.0 };
+        if let Some(last) = last_steering {
+            let change_deg = (steering - last) * geometry.full_lock_deg;
+            run.whiteness_sum += change_deg * change_deg / dt_s;
+        }
+        last_steering = Some(steering);
+        let ahead_m = options.look_ahead.distance_m(speed_mps);
+        let moment = ReplayMoment {
+            time_s: run.time_s,
+            row: session.rows.start + row,
+            x_m: pose.x_m,
+            y_m: pose.y_m,
+            heading_deg: pose.heading.to_degrees(),
+            along_m: at_m,
+            offset_m: offset.right_m,
+            turn_deg: offset.turn.to_degrees(),
+            steering,
+            pursuit: path.pursuit(geometry, pose, at_m, ahead_m).map(|s| s.clamp(-1.0, 1.0)),
+            speed_mps,
+            put_back: std::mem::take(&mut put_back),
+        };
+        seen(&ReplayFrame { view, session, moment })?;
+        run.moments.push(moment);
+        on_the_way.push_back(steering);
+        let in_force = on_the_way.pop_front().unwrap_or(steering);
+        pose = pose.moved(speed_mps * dt_s, geometry.curvature(in_force));
+        run.time_s += dt_s;
+        let (next_m, offset) = path.locate(pose, at_m, 3.0 * speed_mps * dt_s);
+        // A car across the path makes no way along it, but it is put back long before it can stand still there.
+        at_m = next_m.max(at_m);
+        if offset.right_m.abs() > MAX_OFFSET_M || offset.turn.abs().to_degrees() > MAX_TURN_DEG {
+            run.interventions += 1;
+            put_back = true;
+            pose = path.pose_at(at_m).unwrap_or_default();
+            on_the_way.iter_mut().for_each(|steering| *steering = 0.0);
+        }
+    }
+    run.distance_m = at_m;
+    Ok(run)
+}
+
+/// The row, within the session, that was recorded nearest to `at_m`.
+fn nearest_row(session: &ReplaySession, at_m: f64) -> usize {
+    let before = session.path.row_at(at_m);
+    let after = (before + 1).min(session.path.len() - 1);
+    if session.path.along_m(after) - at_m < at_m - session.path.along_m(before) { after } else { before }
+}
+
+/// Looks at the recorded world from beside the path.
+#[derive(Default)]
+struct Eye {
+    frames: Frames,
+    view: RgbImage,
+}
+
+impl Eye {
+    /// The view of a car at `offset` from where it was at `row` of the session: made of the picture of the nearest camera.
+    fn look(&mut self, log: &ReplayLog, session: &ReplaySession, row: usize, offset: Offset) -> Result<&RgbImage> {
+        let row = session.rows.start + row;
+        let [left_m, right_m] = log.geometry.side_offsets_m;
+        let (camera, taken_m) = [(View::Centre, 0.0), (View::Left, left_m), (View::Right, right_m)]
+            .into_iter()
+            .filter(|(camera, _)| log.recording.row_has(row, *camera))
+            .min_by(|a, b| (offset.right_m - a.1).abs().total_cmp(&(offset.right_m - b.1).abs()))
+            .unwrap_or((View::Centre, 0.0));
+        let picture = self.frames.get(log.recording, row, camera)?;
+        let size = [picture.height, picture.width];
+        let warp = ViewWarp::new(&log.geometry, PixelGrid::whole(&log.geometry, size), taken_m, offset);
+        self.view.height = picture.height;
+        self.view.width = picture.width;
+        self.view.pixels.resize(picture.pixels.len(), 0);
+        warp.apply(&picture.pixels, &mut self.view.pixels);
+        Ok(&self.view)
+    }
+}
+
+/// The measures over all sessions, which took `seconds` to drive.
+pub fn summarise(runs: &[ReplayRun], seconds: f64) -> ReplaySummary {
+    let time_s: f64 = runs.iter().map(|run| run.time_s).sum();
+    let distance_m: f64 = runs.iter().map(|run| run.distance_m).sum();
+    let interventions: usize = runs.iter().map(|run| run.interventions).sum();
+    let whiteness_sum: f64 = runs.iter().map(|run| run.whiteness_sum).sum();
+    let mut offsets: Vec<f64> = runs.iter().flat_map(|run| &run.moments).map(|m| m.offset_m.abs()).collect();
+    offsets.sort_by(f64::total_cmp);
+    let n = offsets.len().max(1) as f64;
+    let p95 = offsets.get(((offsets.len() as f64 * 0.95) as usize).min(offsets.len().saturating_sub(1)));
+    ReplaySummary {
+        sessions: runs.len(),
+        autonomy_percent: autonomy_percent(interventions, time_s),
+        interventions,
+        interventions_per_km: interventions as f64 / (distance_m / 1000.0).max(1e-9),
+        distance_m,
+        time_s,
+        offset_mean_m: offsets.iter().sum::<f64>() / n,
+        offset_rms_m: (offsets.iter().map(|m| m * m).sum::<f64>() / n).sqrt(),
+        offset_p95_m: p95.copied().unwrap_or(0.0),
+        whiteness_deg_s: (whiteness_sum / time_s.max(1e-9)).sqrt(),
+        frames: offsets.len(),
+        frames_per_second: offsets.len() as f64 / seconds.max(1e-9),
+    }
+}
+
+/// The moments of a drive as CSV, one a line, with a header.
+pub fn moments_csv(run: &ReplayRun) -> String {
+    let mut text =
+        String::from("time_s,row,x_m,y_m,heading_deg,along_m,offset_m,turn_deg,steering,pursuit,speed_mps,put_back\n");
+    for m in &run.moments {
+        text += &format!(
+            "{:.3},{},{:.4},{:.4},{:.3},{:.3},{:.4},{:.3},{:.6},{},{:.3},{}\n",
+            m.time_s,
+            m.row,
+            m.x_m,
+            m.y_m,
+            m.heading_deg,
+            m.along_m,
+            m.offset_m,
+            m.turn_deg,
+            m.steering,
+            m.pursuit.map_or(String::new(), |steering| format!("{steering:.6}")),
+            m.speed_mps,
+            u8::from(m.put_back)
+        );
+    }
+    text
+}

@@ -1,0 +1,129 @@
+//! Closed loop on recorded pictures: `drive --on RECORDING`, and the views that it is made of.
+
+mod common;
+
+use std::path::Path;
+use std::sync::Mutex;
+
+use common::command::{error, json, run};
+use steersman::dataset;
+use steersman::geometry::{CarGeometry, LookAhead};
+use steersman::picture::RgbImage;
+use steersman::replay::{ReplayLog, ReplayOptions, ReplayRun, replay, side_camera_check, summarise};
+
+/// A quarter of a lap of `lake` by the expert, with keys.
+fn record(dir: &Path) {
+    run(dir, &["record", "--track", "lake", "--laps", "0.25", "--style", "keyboard", "--out", "drive"]);
+}
+
+/// Drives with `steer`, which is told the pursuit of the path at the frame before.
+fn drive(log: &ReplayLog, latency_ms: f64, steer: impl Fn(f64) -> f32 + Sync) -> Vec<ReplayRun> {
+    let options = ReplayOptions { latency_ms, ..ReplayOptions::usual(&log.geometry) };
+    let pursuit = Mutex::new(0.0);
+    let driver = || Ok(|_: &RgbImage| Ok(steer(*pursuit.lock().unwrap())));
+    let seen = |_: usize, frame: &steersman::replay::ReplayFrame| {
+        *pursuit.lock().unwrap() = frame.moment.pursuit.unwrap_or(0.0);
+        Ok(())
+    };
+    replay(log, &options, driver, &seen).unwrap()
+}
+
+#[test]
+fn who_pursues_the_path_stays_on_it_and_who_does_not_is_put_back() {
+    let scratch = tempfile::tempdir().unwrap();
+    record(scratch.path());
+    let recording = dataset::load(&scratch.path().join("drive")).unwrap();
+    let log = ReplayLog::new(&recording, CarGeometry::preset("steersman").unwrap()).unwrap();
+    assert_eq!((log.sessions.len(), log.assumed_speed_mps), (1, None));
+
+    let good = summarise(&drive(&log, 0.0, |pursuit| pursuit as f32), 1.0);
+    assert_eq!((good.interventions, good.autonomy_percent), (0, 100.0));
+    assert!(good.offset_p95_m < 0.2, "{good:?}");
+    assert!((good.distance_m - log.sessions[0].path.length_m()).abs() < 1e-3);
+
+    let zero = drive(&log, 0.0, |_| 0.0);
+    let summary = summarise(&zero, 1.0);
+    assert!(summary.interventions >= 3 && summary.whiteness_deg_s == 0.0, "{summary:?}");
+    let charged = 6.0 * summary.interventions as f64;
+    assert!((summary.autonomy_percent - (100.0 * (1.0 - charged / summary.time_s)).max(0.0)).abs() < 1e-9);
+    // The moment after each intervention the car is on the path again.
+    let moments = &zero[0].moments;
+    assert!(moments.iter().all(|m| m.offset_m.abs() <= 1.0 && m.turn_deg.abs() <= 15.0));
+    let back: Vec<_> = moments.iter().filter(|m| m.put_back).collect();
+    assert!(!back.is_empty() && back.iter().all(|m| m.offset_m.abs() < 1e-6 && m.turn_deg.abs() < 1e-6));
+
+    let late = summarise(&drive(&log, 400.0, |pursuit| pursuit as f32), 1.0);
+    assert!(late.offset_rms_m > good.offset_rms_m, "{late:?}");
+    // A driver that answers nonsense steers straight ahead.
+    assert!(drive(&log, 0.0, |_| f32::NAN) == zero);
+}
+
+#[test]
+fn views_from_the_path_are_the_recorded_ones_and_warped_ones_resemble_the_side_cameras() {
+    let scratch = tempfile::tempdir().unwrap();
+    record(scratch.path());
+    let recording = dataset::load(&scratch.path().join("drive")).unwrap();
+    let log = ReplayLog::new(&recording, CarGeometry::preset("steersman").unwrap()).unwrap();
+    let first = Mutex::new(None);
+    let driver = || Ok(|_: &RgbImage| Ok(0.0));
+    replay(&log, &ReplayOptions::usual(&log.geometry), driver, &|_, frame| {
+        first.lock().unwrap().get_or_insert_with(|| (frame.moment, frame.view.clone()));
+        Ok(())
+    })
+    .unwrap();
+    let (moment, view) = first.into_inner().unwrap().unwrap();
+    let mut recorded = RgbImage::default();
+    let bytes = std::fs::read(recording.image_path(moment.row, dataset::View::Centre).unwrap()).unwrap();
+    steersman::picture::decode::decode_rgb(&bytes, &mut recorded).unwrap();
+    assert_eq!(moment.row, 0);
+    assert!(view.pixels.iter().zip(&recorded.pixels).all(|(a, b)| a.abs_diff(*b) <= 1));
+
+    // On the road region the error is at most half of that without the warp.
+    let check = side_camera_check(&log).unwrap().unwrap();
+    assert!(check.rows > 50 && check.ratio() <= 0.5, "{check:?}");
+    // Cameras that sit elsewhere than is said are found out.
+    let wrong = CarGeometry { side_offsets_m: [0.8, -0.8], ..log.geometry.clone() };
+    let check = side_camera_check(&ReplayLog::new(&recording, wrong).unwrap()).unwrap().unwrap();
+    assert!(check.ratio() > 1.0 && check.doubtful > check.rows / 2, "{check:?}");
+}
+
+#[test]
+fn path_labels_are_smoother_than_keys_and_mean_the_same_road() {
+    let scratch = tempfile::tempdir().unwrap();
+    record(scratch.path());
+    let recording = dataset::load(&scratch.path().join("drive")).unwrap();
+    let geometry = CarGeometry::preset("steersman").unwrap();
+    let log = ReplayLog::of_any_length(&recording, geometry.clone());
+    let labels = log.path_labels(LookAhead::usual(&geometry));
+    let pairs: Vec<(f64, f64)> = (labels.iter().zip(&recording.rows))
+        .filter_map(|(label, row)| Some((f64::from((*label)?), f64::from(row.steering))))
+        .collect();
+    assert!(pairs.len() + 15 > recording.rows.len(), "only the end of the session has no label");
+    let change = |of: fn(&(f64, f64)) -> f64| pairs.windows(2).map(|w| (of(&w[1]) - of(&w[0])).abs()).sum::<f64>();
+    assert!(change(|p| p.0) < 0.5 * change(|p| p.1), "the path's label changes less than the keys' steering");
+    let mean = |of: fn(&(f64, f64)) -> f64| pairs.iter().map(of).sum::<f64>() / pairs.len() as f64;
+    assert!((mean(|p| p.0) - mean(|p| p.1)).abs() < 0.01);
+}
+
+#[test]
+fn the_command_tells_writes_and_refuses() {
+    let scratch = tempfile::tempdir().unwrap();
+    let dir = scratch.path();
+    record(dir);
+    let told = |threads: &str, out: &str| {
+        let mut report = json(dir, &["drive", "zero", "--on", "drive", "--threads", threads, "--out", out, "--json"]);
+        report.as_object_mut().unwrap().remove("frames_per_second");
+        (report, std::fs::read_to_string(dir.join(out).join("session_1.csv")).unwrap())
+    };
+    let (report, csv) = told("1", "one");
+    assert_eq!((&report, &csv), (&told("2", "two").0, &csv));
+    assert!(report["interventions"].as_u64() > Some(2) && report["warp"]["rows"].as_u64() > Some(50), "{report}");
+    assert_eq!(csv.lines().count() as u64, 1 + report["frames"].as_u64().unwrap());
+    assert!(dir.join("one/summary.json").is_file());
+
+    let said = |args: &[&str]| error(dir, args);
+    assert!(said(&["drive", "expert", "--on", "drive"]).contains("name a model"));
+    assert!(said(&["drive", "zero", "--on", "drive", "--camera", "tank"]).contains("udacity-straight"));
+    assert!(said(&["drive", "zero", "--on", "nowhere"]).contains("nowhere"));
+    assert!(said(&["drive", "zero", "--on", "drive", "--latency-ms=-1"]).contains("latency"));
+}
