@@ -87,7 +87,7 @@ impl ZipArchive {
             return Err("is encrypted".into());
         }
         if entry.len > max_len {
-            return Err(format!("unpacks to {} bytes; more than {max_len} are not read", entry.len));
+            return Err(format!("unpacks to more than {max_len} bytes, which is too long for it"));
         }
         let header = bytes_at(source, entry.header_at, 30)?;
         if !header.starts_with(SIGNATURE) {

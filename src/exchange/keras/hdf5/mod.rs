@@ -1,12 +1,13 @@
 //! Reading of HDF5 files as Keras writes them (HDF5 File Format Specification, version 3.0).
 //!
-//! What h5py writes by default is read: groups by symbol tables or by links in their header, attributes in the header, strings
-//! of fixed and of variable length, tensors in one piece. Chunks, filters and groups that are indexed by fractal heaps are
-//! refused with a remedy; Keras uses none of them.
+//! What h5py writes by itself is read: groups by symbol tables, links in their header and links in a heap, attributes in the
+//! header, strings of fixed and of variable length, tensors in one piece. Chunks, filters and attributes in a heap are refused with
+//! a remedy; Keras uses none of them.
 //!
 //! The file lies in memory, and every address and length is checked against it. Loops that a damaged file could close are
 //! bounded by what an honest file can hold.
 
+mod heap;
 mod values;
 
 use std::ops::Range;
@@ -227,15 +228,15 @@ impl Object {
         self.messages.iter().any(|message| message.kind == kind)
     }
 
-    /// Refuses entries that lie in a fractal heap. `flags` say whether a number of `wide` bytes stands before its address.
-    fn refuse_heap(&self, kind: u16, wide: usize) -> Result<()> {
-        for info in self.all(kind) {
+    /// Refuses attributes that lie in a fractal heap.
+    fn refuse_attribute_heap(&self) -> Result<()> {
+        for info in self.all(ATTRIBUTE_INFO) {
             let mut info = info?;
             info.take(1)?;
             let flags = info.u8()?;
-            info.take(if flags & 1 != 0 { wide } else { 0 })?;
+            info.take(if flags & 1 != 0 { 2 } else { 0 })?;
             if info.u64()? != UNDEFINED {
-                return Err(format!("`{}` has so many entries that they are in a heap; {REMEDY}", self.name));
+                return Err(format!("`{}` has so many attributes that they are in a heap; {REMEDY}", self.name));
             }
         }
         Ok(())
@@ -243,20 +244,24 @@ impl Object {
 
     /// Names and addresses of the entries of a group, in the order of the file.
     fn links(&self) -> Result<Vec<(String, u64)>> {
-        self.refuse_heap(LINK_INFO, 8)?;
-        let mut links = vec![];
-        for link in self.all(LINK) {
-            let mut link = link?;
-            link.take(1)?;
-            let flags = link.u8()?;
-            let kind = if flags & 8 != 0 { link.u8()? } else { 0 };
-            link.take(if flags & 4 != 0 { 8 } else { 0 } + if flags & 0x10 != 0 { 1 } else { 0 })?;
-            let len = link.uint(1 << (flags & 3))?;
-            let name = text(link.take(usize::try_from(len).unwrap_or(usize::MAX))?)?;
-            if kind == 0 {
-                links.push((name, link.u64()?));
+        let mut entries = self.all(LINK).collect::<Result<Vec<Cursor>>>()?;
+        for info in self.all(LINK_INFO) {
+            let mut info = info?;
+            info.take(1)?;
+            let flags = info.u8()?;
+            info.take(if flags & 1 != 0 { 8 } else { 0 })?;
+            let (heap_at, names_at) = (info.u64()?, info.u64()?);
+            if heap_at != UNDEFINED {
+                entries.extend(heap::objects(&self.file, heap_at, names_at)?);
             }
         }
+        // Entries of a heap are listed by a hash of their names: those that have no number are sorted by name.
+        let mut links = entries.into_iter().filter_map(|entry| link(entry).transpose()).collect::<Result<Vec<_>>>()?;
+        links.sort();
+        if links.len() > MAX_LINKS {
+            return Err(format!("`{}` has more than {MAX_LINKS} entries", self.name));
+        }
+        let mut links: Vec<(String, u64)> = links.into_iter().map(|(_, name, at)| (name, at)).collect();
         if self.has(SYMBOL_TABLE) {
             let mut table = self.first(SYMBOL_TABLE)?;
             let (tree_at, mut nodes_left) = (table.u64()?, MAX_LINKS);
@@ -311,6 +316,22 @@ impl Object {
         }
         Ok(())
     }
+}
+
+/// Number in the order of creation (0 where it is not counted), name and address of an entry; `None` for one that leads
+/// elsewhere.
+fn link(mut entry: Cursor) -> Result<Option<(u64, String, u64)>> {
+    entry.take(1)?;
+    let flags = entry.u8()?;
+    let kind = if flags & 8 != 0 { entry.u8()? } else { 0 };
+    let number = if flags & 4 != 0 { entry.u64()? } else { 0 };
+    entry.take(if flags & 0x10 != 0 { 1 } else { 0 })?;
+    let len = entry.uint(1 << (flags & 3))?;
+    let name = text(entry.take(usize::try_from(len).unwrap_or(usize::MAX))?)?;
+    if kind != 0 {
+        return Ok(None);
+    }
+    Ok(Some((number, name, entry.u64()?)))
 }
 
 /// A group.
@@ -370,7 +391,7 @@ impl Group {
 
     /// All attributes, in the order of the file.
     pub fn attributes(&self) -> Result<Vec<Attribute>> {
-        self.0.refuse_heap(ATTRIBUTE_INFO, 2)?;
+        self.0.refuse_attribute_heap()?;
         self.0.all(ATTRIBUTE).map(|message| Attribute::parse(&self.0.file, message?)).collect()
     }
 }
