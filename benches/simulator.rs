@@ -6,11 +6,11 @@ use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_m
 use steersman::model_file::{Model, TrainingRecord};
 use steersman::pilot::Pilot;
 use steersman::recipe::Recipe;
-use steersman::simulator::camera::jpeg;
-use steersman::simulator::trial::run::run;
+use steersman::simulator::jpeg;
+use steersman::simulator::run_trial;
 use steersman::simulator::{
-    Camera, DriveState, Driver, Expert, HEIGHT, Mount, Renderer, RgbFrame, RunOptions, Simulation, Speed, Start, Track,
-    Variant, WIDTH,
+    Camera, DriveState, Driver, Expert, HEIGHT, Mount, Renderer, RgbFrame, Simulation, Speed, Start, Track,
+    TrialOptions, Variant, WIDTH,
 };
 use steersman_kernels::Isa;
 
@@ -80,14 +80,14 @@ fn untrained(recipe: &str) -> Pilot {
 /// and decoded.
 fn closed_loop(c: &mut Criterion) {
     let track = Track::load("lake").expect("a built-in track");
-    let options = RunOptions { laps: 1, speed: Speed::Fixed(20.0), latency_ms: 0.0, noise: 0.0, assisted: false };
+    let options = TrialOptions { laps: 1, speed: Speed::Fixed(20.0), latency_ms: 0.0, noise: 0.0, assisted: false };
     let mut group = c.benchmark_group("simulator");
     for (name, pilot) in [("expert", None), ("lenet", Some(untrained("lenet")))] {
         let mut driver = Watching(pilot);
-        let seconds = run(&track, &mut driver, &options, 1).expect("a run").time_s;
+        let seconds = run_trial(&track, &mut driver, &options, 1).expect("a run").time_s;
         group.sample_size(10).throughput(Throughput::Elements(seconds as u64));
         let id = BenchmarkId::new("drive_simulated_seconds", name);
-        group.bench_function(id, |b| b.iter(|| run(&track, &mut driver, &options, 1)));
+        group.bench_function(id, |b| b.iter(|| run_trial(&track, &mut driver, &options, 1)));
     }
     group.finish();
 }

@@ -74,14 +74,15 @@
 //! # Train on numbers of your own
 //!
 //! ```
-//! use steersman::engine::network::{LayerSpec, Network, StepInput, TrainingPlan};
+//! use steersman::engine::layers::DenseSpec;
+//! use steersman::engine::network::{Network, StepInput, TrainingPlan};
 //! use steersman::engine::optimizer::{Optimizer, OptimizerSpec};
 //! use steersman::engine::tensor::{Initializer, Shape};
 //! use steersman::engine::loss::Loss;
 //! use steersman_kernels::Isa;
 //!
 //! // y = x1 − x2, learned by one dense layer.
-//! let layers = [LayerSpec::Dense { units: 1, init: Initializer::GlorotUniform }];
+//! let layers = [DenseSpec { units: 1, init: Initializer::GlorotUniform }.into()];
 //! let network = Network::new(Shape::vector(2), &layers, Isa::best())?;
 //! let (x, labels) = ([1.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.5, 1.0], [1.0, -1.0, 0.0, -0.5]);
 //!
@@ -167,6 +168,7 @@ pub mod report;
 pub mod serve;
 pub mod simulator;
 pub mod simulator_client;
+mod statistics;
 mod text;
 pub mod training;
 pub mod udacity;

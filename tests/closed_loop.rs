@@ -145,7 +145,7 @@ fn the_experiments_train_and_drive_every_variant() {
         };
         let mut told = 0;
         let mut observer = |event| {
-            told += usize::from(matches!(event, ExperimentEvent::Trial(_)));
+            told += usize::from(matches!(event, ExperimentEvent::Row(_)));
             Ok(())
         };
         (experiment::run(&plan, &mut observer, stop), told)

@@ -81,8 +81,8 @@ fn golden_name(network: &str, layer: &str) -> String {
 fn network(name: &str, isa: Isa) -> Network {
     let mut recipe = Recipe::find(name, &[]).unwrap();
     for layer in &mut recipe.layers {
-        if let LayerSpec::Dropout { drop_probability } = layer {
-            *drop_probability = 0.0;
+        if let LayerSpec::Dropout(dropout) = layer {
+            dropout.drop_probability = 0.0;
         }
     }
     recipe.network(isa).unwrap()
@@ -142,7 +142,7 @@ impl LayerByLayer {
             }
             let mut y = vec![f32::NAN; n * layer.output().len()];
             let mut scratch = vec![f32::NAN; layer.scratch_len(n)];
-            let pass = Pass { seed: 0, step: 0, layer: index, first_image: 0, moments: &moments, prepared: &[] };
+            let pass = Pass { seed: 0, step: 0, layer: index, first_image: 0, moments: &moments, packed: &[] };
             layer.forward(params, &pass, n, x, &mut y, &mut scratch);
             outputs.push(y);
             all_moments.push(moments);
@@ -163,7 +163,7 @@ impl LayerByLayer {
             }
             let mut dx = vec![f32::NAN; x.len()];
             let mut scratch = vec![f32::NAN; layer.scratch_len(n)];
-            let pass = Pass { seed: 0, step: 0, layer: index, first_image: 0, moments, prepared: &[] };
+            let pass = Pass { seed: 0, step: 0, layer: index, first_image: 0, moments, packed: &[] };
             let pair = Pair { x, y: &outputs[index], dy: &dy };
             layer.backward(params, &pass, n, pair, Some(&mut dx), Grads { dparams, scratch: &mut scratch });
             dy = dx;

@@ -13,8 +13,8 @@ use common::served::{Client, SIMULATOR, Served, command, random_model, sample_jp
 use serde_json::Value;
 use steersman::observer::Unobserved;
 use steersman::pilot::Pilot;
-use steersman::simulator::trial::run::run;
-use steersman::simulator::{RunOptions, Speed, Track};
+use steersman::simulator::run_trial;
+use steersman::simulator::{Speed, Track, TrialOptions};
 use steersman::simulator_client::{ClientOptions, ClientReport, TimeMode, drive};
 use steersman::udacity::{DecimalMark, NumberStyle};
 
@@ -56,8 +56,8 @@ fn in_lockstep_the_way_through_the_server_is_the_way_of_drive_bit_for_bit_in_eve
     let folder = folder_with_model();
     let served = serve(&folder, &[]);
     let mut pilot = Pilot::load(&folder.path().join("model")).unwrap();
-    let options = RunOptions { laps: 1, speed: Speed::Fixed(20.0), latency_ms: 0.0, noise: 0.0, assisted: false };
-    let expected = run(&Track::load("lake").unwrap(), &mut pilot, &options, 2).unwrap();
+    let options = TrialOptions { laps: 1, speed: Speed::Fixed(20.0), latency_ms: 0.0, noise: 0.0, assisted: false };
+    let expected = run_trial(&Track::load("lake").unwrap(), &mut pilot, &options, 2).unwrap();
     assert!(expected.moments.len() > 30, "{} frames are too few to prove something", expected.moments.len());
     for mark in [DecimalMark::DOT, DecimalMark::COMMA] {
         let report = drive_lake(&ClientOptions { numbers: NumberStyle::Strings(mark), ..lockstep(&served) });

@@ -11,9 +11,9 @@ use serde_json::Value;
 use steersman::Error;
 use steersman::observer::Unobserved;
 use steersman::picture::{RgbImage, decode::decode_rgb};
-use steersman::simulator::car::speed::SpeedController;
-use steersman::simulator::trial::run::run;
-use steersman::simulator::{DriveState, Driver, RgbFrame, RunOptions, Speed, Track};
+use steersman::simulator::SpeedController;
+use steersman::simulator::run_trial;
+use steersman::simulator::{DriveState, Driver, RgbFrame, Speed, Track, TrialOptions};
 use steersman::simulator_client::{ClientOptions, ClientReport, TimeMode, drive};
 use steersman::udacity::{DecimalMark, NumberStyle};
 
@@ -84,8 +84,8 @@ fn in_lockstep_a_drive_over_the_wire_is_the_drive_in_this_process_bit_for_bit() 
     });
     let options = ClientOptions { frames: None, ..lockstep(port, 0) };
     let report = drive_lake(&options);
-    let here = RunOptions { laps: 1, speed: Speed::Fixed(20.0), latency_ms: 0.0, noise: 0.0, assisted: false };
-    let expected = run(&Track::load("lake").unwrap(), &mut AwayFromLight, &here, 3).unwrap();
+    let here = TrialOptions { laps: 1, speed: Speed::Fixed(20.0), latency_ms: 0.0, noise: 0.0, assisted: false };
+    let expected = run_trial(&Track::load("lake").unwrap(), &mut AwayFromLight, &here, 3).unwrap();
     assert!(expected.moments.len() > 40, "{} frames are too few to prove something", expected.moments.len());
     assert_eq!(report.run, expected);
     assert_eq!(report.telemetries as usize, expected.moments.len());

@@ -8,8 +8,9 @@
 //! | leaky ReLU (Maas et al. 2013) | as PReLU, with one fixed slope | as PReLU |
 //! | tanh | `tanh x` | `dy (1 - y^2)` |
 //! | softsign | `x / (1 + \|x\|)` | `dy (1 - \|y\|)^2` |
+//! | swish, SiLU (Elfwing et al. 2017) | `x s(x)` with `s(x) = 1 / (1 + e^-x)` | `dy s(x) (1 + x (1 - s(x)))` |
 //!
-//! ReLU, ELU, tanh and softsign need only their output `y` to go backward, PReLU and leaky ReLU their input `x`.
+//! ReLU, ELU, tanh and softsign need only their output `y` to go backward, PReLU, leaky ReLU and swish their input `x`.
 
 /// `e^x - 1` for `x <= 0`, relative error below 1e-6; the same operations in the same order in every lane.
 ///
@@ -139,6 +140,43 @@ per_isa! {
     }
 }
 
+/// `s(x) = 1 / (1 + e^-x)` and `1 - s(x)` for `x >= -50`, absolute error below 1e-6: with `t = e^-|x| - 1`, the larger of them is
+/// `1 / (2 + t)`, the smaller `(1 + t) / (2 + t)`.
+#[inline(always)]
+fn sigmoid_and_rest(x: f32) -> (f32, f32) {
+    let t = expm1_of_negative(-x.abs());
+    let larger = 1.0 / (t + 2.0);
+    let smaller = (t + 1.0) * larger;
+    if x > 0.0 { (larger, smaller) } else { (smaller, larger) }
+}
+
+per_isa! {
+    /// `y = x s(x)` with `s(x) = 1 / (1 + e^-x)`, absolute error below `1e-6 max(1, |x|)`.
+    pub fn swish_forward<S>(_simd: S, x: &[f32], y: &mut [f32]) {
+        assert_eq!(x.len(), y.len(), "swish_forward: x and y differ in length");
+        for (y, &x) in y.iter_mut().zip(x) {
+            // Below -50, y is 0 in all but name; so -inf goes to 0, and NaN stays.
+            let z = if x < -50.0 { -50.0 } else { x };
+            let value = z * sigmoid_and_rest(z).0;
+            *y = if x.is_nan() { x } else { value };
+        }
+    }
+}
+
+per_isa! {
+    /// The gradient of [`swish_forward`] from its input `x`: `dx = dy (s + x s (1 - s))`; `dx` is overwritten.
+    pub fn swish_backward<S>(_simd: S, x: &[f32], dy: &[f32], dx: &mut [f32]) {
+        assert!(x.len() == dy.len() && x.len() == dx.len(), "swish_backward: x, dy and dx differ in length");
+        for ((dx, &dy), &x) in dx.iter_mut().zip(dy).zip(x) {
+            // Beyond 50 on either side the slope is that at 50: 0 or 1.
+            let z = x.clamp(-50.0, 50.0);
+            let (sigmoid, rest) = sigmoid_and_rest(z);
+            let slope = sigmoid * (1.0 + z * rest);
+            *dx = if x.is_nan() { x } else { dy * slope };
+        }
+    }
+}
+
 per_isa! {
     /// `y = x` where `x > 0`, else `slope x`, for `n` images.
     ///
@@ -254,6 +292,35 @@ mod tests {
             let mut y = [1.0; 4];
             tanh_forward(isa, &[f32::NAN, 0.0, f32::NEG_INFINITY, f32::INFINITY], &mut y);
             assert!(y[0].is_nan() && y[1] == 0.0 && y[2] == -1.0 && y[3] == 1.0, "{y:?}");
+        }
+    }
+
+    #[test]
+    fn swish_is_within_its_bound_of_the_truth_and_goes_to_its_limits() {
+        for isa in Isa::available() {
+            let x: Vec<f32> = (-200_000..200_000).map(|i| i as f32 / 1000.0).collect();
+            let (mut y, mut dx) = (vec![f32::NAN; x.len()], vec![f32::NAN; x.len()]);
+            swish_forward(isa, &x, &mut y);
+            swish_backward(isa, &x, &vec![1.0; x.len()], &mut dx);
+            for ((&x, &y), &dx) in x.iter().zip(&y).zip(&dx) {
+                let s = 1.0 / (1.0 + (-f64::from(x)).exp());
+                let (truth, slope) = (f64::from(x) * s, s + f64::from(x) * s * (1.0 - s));
+                let bound = 1e-6 * f64::from(x).abs().max(1.0);
+                assert!((f64::from(y) - truth).abs() <= bound, "{}: swish({x:e}) = {y:e}", isa.name());
+                assert!((f64::from(dx) - slope).abs() <= bound, "{}: slope of swish at {x:e} is {dx:e}", isa.name());
+            }
+            let ends = [f32::NAN, f32::NEG_INFINITY, -1e30, 0.0, f32::INFINITY];
+            let (mut y, mut dx) = ([7.0; 5], [7.0; 5]);
+            swish_forward(isa, &ends, &mut y);
+            swish_backward(isa, &ends, &[1.0; 5], &mut dx);
+            assert!(
+                y[0].is_nan() && y[1].abs() < 1e-19 && y[2].abs() < 1e-19 && y[3] == 0.0 && y[4] == f32::INFINITY,
+                "{y:?}"
+            );
+            assert!(
+                dx[0].is_nan() && dx[1].abs() < 1e-19 && dx[2].abs() < 1e-19 && dx[3] == 0.5 && dx[4] == 1.0,
+                "{dx:?}"
+            );
         }
     }
 

@@ -203,6 +203,25 @@ pub fn softsign_backward(y: &[f32], dy: &[f32], dx: &mut [f32]) {
     }
 }
 
+fn sigmoid(x: f32) -> f64 {
+    1.0 / (1.0 + (-f64::from(x)).exp())
+}
+
+/// See [`crate::activation::swish_forward`].
+pub fn swish_forward(x: &[f32], y: &mut [f32]) {
+    for i in 0..x.len() {
+        y[i] = (f64::from(x[i]) * sigmoid(x[i])) as f32;
+    }
+}
+
+/// See [`crate::activation::swish_backward`].
+pub fn swish_backward(x: &[f32], dy: &[f32], dx: &mut [f32]) {
+    for i in 0..x.len() {
+        let s = sigmoid(x[i]);
+        dx[i] = (f64::from(dy[i]) * (s + f64::from(x[i]) * s * (1.0 - s))) as f32;
+    }
+}
+
 /// See [`crate::activation::prelu_forward`].
 pub fn prelu_forward(slopes: &[f32], repeat: usize, x: &[f32], y: &mut [f32]) {
     for i in 0..x.len() {

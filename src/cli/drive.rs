@@ -20,8 +20,8 @@ use crate::report::video::drive::DriveVideo;
 use crate::report::video::onlooker::Onlooker;
 use crate::report::video::painter::Captions;
 use crate::simulator::trial::drive::drive;
-use crate::simulator::trial::drive::write_trajectories;
 use crate::simulator::trial::statistics::PairedTest;
+use crate::simulator::trial::trajectory::write_trajectories;
 use crate::simulator::{
     DriveOptions, DriveResult, DriveSummary, Driver, Expert, Speed, Track, Zero, compare, drive_observed,
 };
@@ -221,7 +221,8 @@ impl Wheel {
     ) -> Result<()> {
         let mut bar = ShareBar::new("filming", stop);
         let mut driver = self.driver();
-        let (summary, stopped) = video.film(track, driver.as_mut(), &options.of_run(false), options.seed, &mut bar)?;
+        let (summary, stopped) =
+            video.film(track, driver.as_mut(), &options.trial_options(false), options.seed, &mut bar)?;
         drop(bar);
         if let Some(path) = &args.video {
             tell_video(path, &summary);

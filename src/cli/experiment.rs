@@ -8,7 +8,7 @@ use super::progress::JobDisplay;
 use super::{RecipeArgs, or_dash, pool, print_json, refuse_existing, stop_on_ctrl_c};
 use crate::dataset::held_out::{self, trained_on_held_out};
 use crate::error::{Error, Result};
-use crate::main_job::experiment::{self, ExperimentEvent, Plan, Subject, Trial, takes, write_csv};
+use crate::main_job::experiment::{self, ExperimentEvent, ExperimentRow, Plan, Subject, takes, write_csv};
 use crate::main_job::job::{RECORDINGS, training_set};
 use crate::main_job::training_set::RANDOM_TRACKS;
 use crate::observer::Observer;
@@ -106,7 +106,7 @@ pub fn run(args: ExperimentArgs) -> Result<()> {
     let mut done = Vec::new();
     let mut observer = |event| match event {
         ExperimentEvent::Job(event) => display.observe(event),
-        ExperimentEvent::Trial(trial) => {
+        ExperimentEvent::Row(trial) => {
             done.push(trial);
             write_csv(&out, &done)
         }
@@ -149,7 +149,7 @@ fn new_csv(out: Option<PathBuf>, subject: SubjectArg) -> Result<PathBuf> {
     Ok(out)
 }
 
-fn print_table(plan: &Plan, trials: &[Trial]) {
+fn print_table(plan: &Plan, trials: &[ExperimentRow]) {
     println!(
         "recipe {}, {} epochs, {} recordings; {} trainings of each; driven: {}, {} runs of a lap on each",
         plan.recipe.name,
@@ -164,9 +164,9 @@ fn print_table(plan: &Plan, trials: &[Trial]) {
     let mut variants: Vec<&str> = trials.iter().map(|trial| trial.variant.as_str()).collect();
     variants.dedup();
     for variant in variants {
-        let of: Vec<&Trial> = trials.iter().filter(|trial| trial.variant == variant).collect();
-        let mean = |f: &dyn Fn(&Trial) -> f64| of.iter().map(|trial| f(trial)).sum::<f64>() / of.len() as f64;
-        let present = |f: &dyn Fn(&Trial) -> Option<f64>| {
+        let of: Vec<&ExperimentRow> = trials.iter().filter(|trial| trial.variant == variant).collect();
+        let mean = |f: &dyn Fn(&ExperimentRow) -> f64| of.iter().map(|trial| f(trial)).sum::<f64>() / of.len() as f64;
+        let present = |f: &dyn Fn(&ExperimentRow) -> Option<f64>| {
             of.iter().map(|trial| f(trial)).sum::<Option<f64>>().map(|sum| sum / of.len() as f64)
         };
         let low = of.iter().map(|trial| trial.autonomy_percent).fold(f64::INFINITY, f64::min);

@@ -10,7 +10,7 @@ use crate::error::Result;
 use crate::live::coverage::Shares;
 use crate::live::{DEFAULT_PORT, ManualDrive};
 use crate::simulator::car::expert::Style;
-use crate::simulator::recorder::record::{RECORD_HZ, RecordingInfo};
+use crate::simulator::recorder::options::{RECORD_HZ, RecordingInfo};
 use crate::simulator::{LogFormat, RecordOptions, Track, record};
 
 /// Record the expert driver in the simulator, or with --manual your own driving, in the format of Udacity's simulator

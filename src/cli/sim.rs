@@ -12,10 +12,10 @@ use crate::files::atomic_file;
 use crate::files::new_folder::create_now;
 use crate::observer::Observer;
 use crate::simulator::Track;
-use crate::simulator::trial::run::{Failure, line_errors_m};
-use crate::simulator::trial::statistics::quantile;
+use crate::simulator::trial::outcome::{Failure, line_errors_m};
 use crate::simulator::trial::trajectory::trajectory_csv;
 use crate::simulator_client::{ClientEvent, ClientOptions, ClientReport, ServerUrl, TimeMode, drive};
+use crate::statistics::quantile;
 use crate::udacity::{DecimalMark, NumberStyle};
 
 /// Put the built-in simulator in the place of Udacity's: it connects to a driving server, as `serve` is one

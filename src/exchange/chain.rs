@@ -1,6 +1,7 @@
 //! A network without its training: a chain of operations with their numbers.
 
-use crate::engine::network::{LayerSpec, NamedLayer, Network, Parameters};
+use crate::engine::layers::ExportForm;
+use crate::engine::network::{NamedLayer, Network, Parameters};
 use crate::engine::tensor::Shape;
 use crate::error::{Error, Result};
 
@@ -11,129 +12,38 @@ pub(crate) struct Step {
     pub name: String,
     pub input: Shape,
     pub output: Shape,
-    pub op: Op,
+    /// What it computes; never [`ExportForm::Identity`].
+    pub form: ExportForm,
 }
 
-/// What a step computes. The formulas are those of the layers in [`layers`](crate::engine::layers).
-#[derive(Clone, Debug, PartialEq)]
-pub(crate) enum Op {
-    /// `weight` is `[filters][channels][kernel height][kernel width]`.
-    Conv {
-        kernel: [usize; 2],
-        stride: [usize; 2],
-        pads: Pads,
-        weight: Vec<f32>,
-        bias: Vec<f32>,
-    },
-    /// `weight` is `[units][inputs]`.
-    Dense {
-        weight: Vec<f32>,
-        bias: Vec<f32>,
-    },
-    BatchNorm {
-        gamma: Vec<f32>,
-        beta: Vec<f32>,
-        mean: Vec<f32>,
-        variance: Vec<f32>,
-        epsilon: f32,
-    },
-    Scale {
-        factor: f32,
-        offset: f32,
-    },
-    Relu,
-    Elu {
-        alpha: f32,
-    },
-    LeakyRelu {
-        slope: f32,
-    },
-    Tanh,
-    Softsign,
-    /// One slope for every element of the map, or one for each channel.
-    PRelu {
-        slopes: Vec<f32>,
-    },
-    MaxPool {
-        window: [usize; 2],
-        stride: [usize; 2],
-    },
-    AveragePool {
-        window: [usize; 2],
-        stride: [usize; 2],
-    },
-    /// The output is the window of the input that begins at this row and column.
-    Crop {
-        top: usize,
-        left: usize,
-    },
-    /// The input lies in the output from this row and column on, with zeros around.
-    ZeroPad {
-        top: usize,
-        left: usize,
-    },
-    Flatten,
-}
-
-/// Zeros around the input of a convolution.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Pads {
-    pub top: usize,
-    pub left: usize,
-    pub bottom: usize,
-    pub right: usize,
+impl Step {
+    /// How many weights or slopes it has.
+    pub fn weight_len(&self) -> usize {
+        match &self.form {
+            ExportForm::Conv { weight, .. } | ExportForm::Dense { weight, .. } => weight.len(),
+            ExportForm::PRelu { slopes } => slopes.len(),
+            ExportForm::Identity
+            | ExportForm::Elementwise(_)
+            | ExportForm::BatchNorm { .. }
+            | ExportForm::MaxPool { .. }
+            | ExportForm::AveragePool { .. }
+            | ExportForm::Crop { .. }
+            | ExportForm::ZeroPad { .. }
+            | ExportForm::Flatten => 0,
+        }
+    }
 }
 
 /// The operations of `network` with `parameters`; layers that do nothing in evaluation are left out.
 pub(crate) fn chain(network: &Network, parameters: &Parameters) -> Vec<Step> {
     let step = |layer: &NamedLayer| {
-        let op = op(layer, parameters)?;
-        Some(Step { name: layer.name.clone(), input: layer.layer.input(), output: layer.layer.output(), op })
+        let (input, output) = (layer.layer.input(), layer.layer.output());
+        let params = &parameters.values[layer.params.clone()];
+        let statistics = &parameters.statistics[layer.statistics.clone()];
+        let form = layer.spec.export_form(input, params, statistics);
+        (form != ExportForm::Identity).then(|| Step { name: layer.name.clone(), input, output, form })
     };
     network.layers().iter().filter_map(step).collect()
-}
-
-fn op(layer: &NamedLayer, parameters: &Parameters) -> Option<Op> {
-    let input = layer.layer.input();
-    let params = &parameters.values[layer.params.clone()];
-    let statistics = &parameters.statistics[layer.statistics.clone()];
-    let halves = |values: &[f32]| {
-        let (a, b) = values.split_at(values.len() / 2);
-        (a.to_vec(), b.to_vec())
-    };
-    let weight_and_bias = |biases: usize| {
-        let (weight, bias) = params.split_at(params.len() - biases);
-        (weight.to_vec(), bias.to_vec())
-    };
-    Some(match layer.spec {
-        LayerSpec::Conv2d { filters, kernel, stride, padding, .. } => {
-            let (top, bottom) = padding.amounts(input.h, kernel[0], stride[0]);
-            let (left, right) = padding.amounts(input.w, kernel[1], stride[1]);
-            let (weight, bias) = weight_and_bias(filters);
-            Op::Conv { kernel, stride, pads: Pads { top, left, bottom, right }, weight, bias }
-        }
-        LayerSpec::BatchNorm { epsilon, .. } => {
-            let ((gamma, beta), (mean, variance)) = (halves(params), halves(statistics));
-            Op::BatchNorm { gamma, beta, mean, variance, epsilon }
-        }
-        LayerSpec::Relu {} => Op::Relu,
-        LayerSpec::Elu { alpha } => Op::Elu { alpha },
-        LayerSpec::LeakyRelu { slope } => Op::LeakyRelu { slope },
-        LayerSpec::Tanh {} => Op::Tanh,
-        LayerSpec::Softsign {} => Op::Softsign,
-        LayerSpec::PRelu { .. } => Op::PRelu { slopes: params.to_vec() },
-        LayerSpec::MaxPool { window, stride } => Op::MaxPool { window, stride: stride.unwrap_or(window) },
-        LayerSpec::AveragePool { window, stride } => Op::AveragePool { window, stride: stride.unwrap_or(window) },
-        LayerSpec::Dropout { .. } => return None,
-        LayerSpec::Flatten {} => Op::Flatten,
-        LayerSpec::Dense { units, .. } => {
-            let (weight, bias) = weight_and_bias(units);
-            Op::Dense { weight, bias }
-        }
-        LayerSpec::Scale { factor, offset } => Op::Scale { factor, offset },
-        LayerSpec::ZeroPad { rows: [top, _], columns: [left, _] } => Op::ZeroPad { top, left },
-        LayerSpec::Crop { rows: [top, _], columns: [left, _] } => Op::Crop { top, left },
-    })
 }
 
 /// Batch normalisation of evaluation is `x · scale + shift` in each channel.
@@ -149,18 +59,24 @@ pub(crate) fn scale_and_shift(gamma: &[f32], beta: &[f32], mean: &[f32], varianc
 /// Refuses numbers that are not finite, which a file of an exported model could not say or would compute nonsense with: those
 /// that folding made, and the scales and shifts of the batch normalisation that is left, as the 32-bit numbers they become.
 pub(crate) fn check_finite(steps: &[Step]) -> Result<()> {
-    for Step { name, op, .. } in steps {
-        let is_finite = match op {
-            Op::Conv { weight, bias, .. } | Op::Dense { weight, bias } => {
-                weight.iter().chain(bias).all(|value| value.is_finite())
+    let all_finite = |values: &[f32]| values.iter().all(|value| value.is_finite());
+    for Step { name, form, .. } in steps {
+        let is_finite = match form {
+            ExportForm::Conv { weight, bias, .. } | ExportForm::Dense { weight, bias } => {
+                all_finite(weight) && all_finite(bias)
             }
-            Op::BatchNorm { gamma, beta, mean, variance, epsilon } => {
+            ExportForm::BatchNorm { gamma, beta, mean, variance, epsilon } => {
                 let Affine { scale, shift } = scale_and_shift(gamma, beta, mean, variance, *epsilon);
                 scale.iter().chain(&shift).all(|value| (*value as f32).is_finite())
             }
-            Op::PRelu { slopes } => slopes.iter().all(|value| value.is_finite()),
-            Op::Scale { factor, offset } => factor.is_finite() && offset.is_finite(),
-            _ => true,
+            ExportForm::PRelu { slopes } => all_finite(slopes),
+            ExportForm::Elementwise(formula) => all_finite(&formula.numbers()),
+            ExportForm::Identity
+            | ExportForm::MaxPool { .. }
+            | ExportForm::AveragePool { .. }
+            | ExportForm::Crop { .. }
+            | ExportForm::ZeroPad { .. }
+            | ExportForm::Flatten => true,
         };
         if !is_finite {
             let message = "its weights, with batch normalisation worked into them, are not finite".into();
@@ -180,11 +96,11 @@ pub(crate) struct Affine {
 pub(crate) fn fold_batch_norm(chain: Vec<Step>) -> Vec<Step> {
     let mut folded: Vec<Step> = Vec::with_capacity(chain.len());
     for step in chain {
-        let before = folded.last_mut().map(|step| &mut step.op);
-        match (before, &step.op) {
+        let before = folded.last_mut().map(|step| &mut step.form);
+        match (before, &step.form) {
             (
-                Some(Op::Conv { weight, bias, .. } | Op::Dense { weight, bias }),
-                Op::BatchNorm { gamma, beta, mean, variance, epsilon },
+                Some(ExportForm::Conv { weight, bias, .. } | ExportForm::Dense { weight, bias }),
+                ExportForm::BatchNorm { gamma, beta, mean, variance, epsilon },
             ) => {
                 let Affine { scale, shift } = scale_and_shift(gamma, beta, mean, variance, *epsilon);
                 let row = weight.len() / bias.len();
@@ -204,6 +120,7 @@ pub(crate) fn fold_batch_norm(chain: Vec<Step>) -> Vec<Step> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::engine::network::LayerSpec;
     use steersman_kernels::Isa;
 
     fn network(layers: &str) -> (Network, Parameters) {
@@ -257,13 +174,18 @@ mod tests {
 
     #[test]
     fn folded_weights_follow_the_formula() {
-        let batch_norm =
-            Op::BatchNorm { gamma: vec![3.0], beta: vec![0.5], mean: vec![2.0], variance: vec![3.75], epsilon: 0.25 };
+        let batch_norm = ExportForm::BatchNorm {
+            gamma: vec![3.0],
+            beta: vec![0.5],
+            mean: vec![2.0],
+            variance: vec![3.75],
+            epsilon: 0.25,
+        };
         let shape = Shape::vector(1);
-        let step = |op| Step { name: String::new(), input: shape, output: shape, op };
-        let dense = Op::Dense { weight: vec![4.0], bias: vec![1.0] };
+        let step = |form| Step { name: String::new(), input: shape, output: shape, form };
+        let dense = ExportForm::Dense { weight: vec![4.0], bias: vec![1.0] };
         // (4 x + 1 − 2) · 3 / 2 + 0.5
-        let expected = Op::Dense { weight: vec![6.0], bias: vec![-1.0] };
+        let expected = ExportForm::Dense { weight: vec![6.0], bias: vec![-1.0] };
         assert_eq!(fold_batch_norm(vec![step(dense), step(batch_norm)]), [step(expected)]);
     }
 }

@@ -13,7 +13,8 @@ use crate::dataset::colour::Colour;
 use crate::dataset::preprocess::Preprocessing;
 use crate::dataset::resize::Interpolation;
 use crate::dataset::{Recording, View};
-use crate::engine::network::{InferencePlan, LayerSpec, Network, Parameters};
+use crate::engine::layers::Family;
+use crate::engine::network::{InferencePlan, Network, Parameters};
 use crate::engine::tensor::Shape;
 use crate::error::{Error, Result};
 use crate::metrics::correlation;
@@ -129,8 +130,8 @@ pub fn combinations(network: &Network) -> Vec<Preprocessing> {
         _ => &[],
     };
     // A network that scales by itself wants grey levels.
-    let first = network.layers().iter().find(|layer| !matches!(layer.spec, LayerSpec::Crop { .. }));
-    let scales_itself = first.is_some_and(|l| matches!(l.spec, LayerSpec::Scale { .. } | LayerSpec::BatchNorm { .. }));
+    let first = network.layers().iter().find(|layer| layer.spec.family() != Family::Rearrangement);
+    let scales_itself = first.is_some_and(|layer| layer.spec.family() == Family::Normalization);
     let scalings = if scales_itself { &SCALINGS[..1] } else { &SCALINGS[..] };
     let mut all = Vec::new();
     for colour in colours {
@@ -240,8 +241,8 @@ mod tests {
     #[test]
     fn the_colour_space_that_the_labels_follow_wins() {
         let layers = [
-            LayerSpec::Scale { factor: 1.0 / 255.0, offset: 0.0 },
-            LayerSpec::Dense { units: 1, init: Default::default() },
+            crate::engine::layers::ScaleSpec { factor: 1.0 / 255.0, offset: 0.0 }.into(),
+            crate::engine::layers::DenseSpec { units: 1, init: Default::default() }.into(),
         ];
         let network = Network::new(Shape::new(3, 4, 8), &layers, Isa::PORTABLE).unwrap();
         let mut parameters = network.initialize(1);

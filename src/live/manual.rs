@@ -15,9 +15,10 @@ use super::server::Live;
 use crate::error::{Error, Result};
 use crate::files::new_folder::NewFolder;
 use crate::observer::StopSignal;
-use crate::simulator::camera::eye::Eye;
+use crate::simulator::camera::front_camera::FrontCamera;
 use crate::simulator::car::dynamics::{Controls, MPS_PER_MPH, STEP_S, STEPS_PER_S};
-use crate::simulator::recorder::record::{RecordingInfo, Sample};
+use crate::simulator::recorder::options::RecordingInfo;
+use crate::simulator::recorder::sample::Sample;
 use crate::simulator::recorder::writer::RowWriter;
 use crate::simulator::{RecordOptions, Simulation, Start, Track};
 
@@ -157,7 +158,7 @@ struct ManualLoop<'a> {
     options: &'a RecordOptions,
     live: &'a Live,
     simulation: Simulation<'a>,
-    eye: Eye<'a>,
+    eye: FrontCamera<'a>,
     cockpit: Cockpit,
     recording: bool,
     notice: String,
@@ -177,7 +178,7 @@ impl<'a> ManualLoop<'a> {
             options,
             live,
             simulation: Simulation::new(track, start, 0.0),
-            eye: Eye::new(track, options.seed),
+            eye: FrontCamera::new(track, options.seed),
             cockpit: Cockpit::default(),
             recording: false,
             notice: "Hold W or the up arrow to drive, R to record.".into(),

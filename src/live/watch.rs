@@ -11,7 +11,7 @@ use crate::picture::RgbImage;
 use crate::pilot::Pilot;
 use crate::report::explain::saliency::Saliency;
 use crate::simulator::camera::jpeg;
-use crate::simulator::{DriveEvent, DriveFrame, HEIGHT, RunOptions, WIDTH};
+use crate::simulator::{DriveEvent, DriveFrame, HEIGHT, TrialOptions, WIDTH};
 
 /// Longest time until a wait notices that it has to end.
 const TICK: Duration = Duration::from_millis(50);
@@ -80,7 +80,7 @@ impl<'e> Observer<DriveEvent<'e>> for Watch<'_> {
 }
 
 impl Watch<'_> {
-    fn begin(&mut self, seed: u64, options: &RunOptions) {
+    fn begin(&mut self, seed: u64, options: &TrialOptions) {
         self.begun += usize::from(self.seed != Some(seed));
         (self.seed, self.real_time, self.trail_id) = (Some(seed), None, self.trail_id + 1);
         let help = if options.assisted { "again, put back when 1 m off the middle" } else { "without help" };

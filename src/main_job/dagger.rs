@@ -7,7 +7,8 @@ use crate::error::Result;
 use crate::files::new_folder::NewFolder;
 use crate::observer::{Observer, Progress};
 use crate::pilot::Pilot;
-use crate::simulator::recorder::record::{drive_and_label, write_recording};
+use crate::simulator::recorder::expert_drive::drive_and_label;
+use crate::simulator::recorder::record::write_recording;
 
 /// What the model drives of each take of the training set.
 const LAPS: f64 = 0.5;

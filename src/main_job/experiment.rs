@@ -76,7 +76,7 @@ pub struct Plan {
 
 /// One training and its drives; a line of the CSV.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Trial {
+pub struct ExperimentRow {
     /// What was varied: a split mode or a colour space.
     pub variant: String,
     /// Seed of split, weights and order.
@@ -107,7 +107,7 @@ pub enum ExperimentEvent {
     /// Something happens in the training or the drives of a trial.
     Job(JobEvent),
     /// A trial is done.
-    Trial(Trial),
+    Row(ExperimentRow),
 }
 
 /// Recordings of the main job's set that an experiment trains on: both training tracks, and of the random tracks as many
@@ -131,7 +131,7 @@ pub fn run(
     plan: &Plan,
     observer: &mut (dyn Observer<ExperimentEvent> + Send),
     stop: &StopSignal,
-) -> Result<Vec<Trial>> {
+) -> Result<Vec<ExperimentRow>> {
     let folder = tempfile::tempdir().map_err(Error::io(std::env::temp_dir()))?;
     let mut trials = Vec::new();
     for (variant, recipe) in plan.subject.variants(&plan.recipe) {
@@ -155,7 +155,7 @@ pub fn run(
             let pilot = Pilot::load(&training.model)?;
             let drives = test_on_tracks(&pilot, &plan.tracks, &options, None, &mut of_job, stop)?;
             let mean = |of: &dyn Fn(&TrackResult) -> f64| drives.iter().map(of).sum::<f64>() / drives.len() as f64;
-            let trial = Trial {
+            let trial = ExperimentRow {
                 variant: variant.into(),
                 seed,
                 leak_percent: training.leak_percent,
@@ -168,7 +168,7 @@ pub fn run(
                 cte_mean_m: mean(&|d| d.drive.cte_mean_m),
                 trained_on_held_out: training.trained_on_held_out,
             };
-            observer.observe(ExperimentEvent::Trial(trial.clone()))?;
+            observer.observe(ExperimentEvent::Row(trial.clone()))?;
             trials.push(trial);
         }
     }
@@ -180,7 +180,7 @@ pub fn run(
 /// # Errors
 ///
 /// [`Error::Io`].
-pub fn write_csv(path: &Path, trials: &[Trial]) -> Result<()> {
+pub fn write_csv(path: &Path, trials: &[ExperimentRow]) -> Result<()> {
     let mut writer = csv::Writer::from_writer(Vec::new());
     for (at, trial) in trials.iter().enumerate() {
         // A record of CSV cannot hold a list, so it is made from the JSON.
@@ -229,7 +229,7 @@ mod tests {
 
     #[test]
     fn the_csv_has_every_field_and_tells_held_out_tracks() {
-        let trial = Trial {
+        let trial = ExperimentRow {
             variant: "blocks".into(),
             seed: 3,
             leak_percent: 12.5,
@@ -244,7 +244,7 @@ mod tests {
         };
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("trials.csv");
-        write_csv(&path, &[trial.clone(), Trial { trained_on_held_out: Vec::new(), ..trial }]).unwrap();
+        write_csv(&path, &[trial.clone(), ExperimentRow { trained_on_held_out: Vec::new(), ..trial }]).unwrap();
         let text = std::fs::read_to_string(&path).unwrap();
         let expected = "variant,seed,leak_percent,val_center_mse,val_mae_deg,fresh_mae_deg,laps_completed,laps_total,\
                         autonomy_percent,cte_mean_m,trained_on_held_out\n\

@@ -14,10 +14,10 @@ use crate::files::new_folder::NewFolder;
 use crate::observer::{Observer, Progress};
 use crate::pilot::Pilot;
 use crate::report::charts::map;
-use crate::simulator::camera::eye::Eye;
-use crate::simulator::recorder::record::drive_expert;
+use crate::simulator::camera::front_camera::FrontCamera;
+use crate::simulator::recorder::expert_drive::drive_expert;
 use crate::simulator::trial::drive::drive;
-use crate::simulator::trial::drive::write_trajectories;
+use crate::simulator::trial::trajectory::write_trajectories;
 use crate::simulator::{DriveOptions, DriveSummary, Driver, HEIGHT, RecordOptions, Track, WIDTH};
 use crate::training::TrainResult;
 
@@ -93,7 +93,7 @@ pub fn test_on_track(
 /// [`Error::Codec`] if a picture cannot be encoded.
 pub fn offline_mae_deg(pilot: &Pilot, track: &Track, seed: u64) -> Result<f64> {
     let samples = drive_expert(track, &RecordOptions { seed, ..Default::default() });
-    let (mut pilot, mut eye) = (pilot.clone(), Eye::new(track, seed));
+    let (mut pilot, mut eye) = (pilot.clone(), FrontCamera::new(track, seed));
     if samples.is_empty() {
         return Err(Error::Data {
             place: track.name().into(),

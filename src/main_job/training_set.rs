@@ -172,7 +172,7 @@ pub(super) fn record_takes(
 mod tests {
     use super::*;
     use crate::observer::Unobserved;
-    use crate::simulator::recorder::record::drive_expert;
+    use crate::simulator::recorder::expert_drive::drive_expert;
     use crate::simulator::{Camera, Mount, Renderer, RgbFrame, Variant};
 
     #[test]

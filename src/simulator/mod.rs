@@ -3,28 +3,40 @@
 //!
 //! World coordinates are metres: x east, y north, z up. Angles of direction run anticlockwise from east. `steering` is
 //! normalised to [-1, 1], + = right; offsets from the reference line are + = right.
+//!
+//! Each room uses only those before it: `math`, `road` (the line, the track file, random tracks), `scenery` (what there is to
+//! see), `track` (a road with its scenery), `car` (its motion, and who moves the wheel), `camera` (its pictures), `trial` (a
+//! measured drive), `recorder` (a drive as a recording).
 
-pub mod camera;
-pub mod car;
-pub mod math;
-pub mod recorder;
-pub mod road;
-pub mod scenery;
-pub mod trial;
+pub(crate) mod camera;
+pub(crate) mod car;
+pub(crate) mod math;
+pub(crate) mod recorder;
+pub(crate) mod road;
+pub(crate) mod scenery;
+pub(crate) mod track;
+pub(crate) mod trial;
 
 pub use camera::contact_sheet::{contact_sheet, side_by_side};
-pub use camera::pinhole::{BodyPose, Camera, HEIGHT, Mount, RgbFrame, WIDTH};
+pub use camera::jpeg;
+pub use camera::pinhole::{Camera, HEIGHT, Mount, RgbFrame, WIDTH};
 pub use camera::renderer::Renderer;
+pub use car::pose::BodyPose;
 pub use car::simulation::{Simulation, Start};
-pub use car::speed::Speed;
-pub use recorder::record::{LogFormat, RecordOptions, record};
-pub use road::track::{Location, Station, Track};
+pub use car::speed::{Speed, SpeedController};
+pub use recorder::options::{LogFormat, RecordOptions};
+pub use recorder::record::record;
+pub use road::line::{Location, Road, Station};
 pub use scenery::light::Variant;
 pub use scenery::world::World;
+pub use track::Track;
 pub use trial::closed_loop::ClosedLoop;
-pub use trial::drive::{DriveOptions, DriveResult, DriveSummary, compare, drive, drive_observed};
-pub use trial::observer::{DriveEvent, DriveFrame};
-pub use trial::run::{DriveState, Driver, Expert, Run, RunOptions, Zero, run_observed};
+pub use trial::drive::{compare, drive, drive_observed};
+pub use trial::driver::{DriveState, Driver, Expert, Zero};
+pub use trial::event::{DriveEvent, DriveFrame};
+pub use trial::outcome::{Trial, TrialOptions};
+pub use trial::run::{run_trial, run_trial_observed};
+pub use trial::summary::{DriveOptions, DriveResult, DriveSummary};
 
 #[cfg(test)]
 mod tests;

@@ -7,7 +7,7 @@ use sha2::{Digest, Sha256};
 
 use super::road::builtin;
 use super::road::spec::TrackSpec;
-use super::trial::run::run;
+use super::trial::run::run_trial;
 use super::trial::trajectory::trajectory_csv;
 use super::*;
 use crate::Error;
@@ -71,7 +71,7 @@ fn random_tracks_exist_for_every_seed_and_high_seeds_are_held_out() {
         assert!((600.0..=1500.0).contains(&track.length_m), "random:{seed}: {} m", track.length_m);
         assert!(track.stations.iter().all(|s| s.curvature.abs() <= 1.0 / 25.0));
         // What is drawn passes the checks that a track file must pass, its stretches too.
-        Track::from_spec(track.spec, "again").unwrap();
+        Track::from_spec(track.spec.clone(), "again").unwrap();
     }
     assert!(matches!(Track::load("random:x"), Err(Error::Usage(m)) if m.contains("seed")));
 }
@@ -161,8 +161,9 @@ fn the_same_seed_gives_the_same_bytes_for_any_number_of_threads() {
 
 #[test]
 fn trajectories_repeat_to_the_bit() {
-    let options = RunOptions { laps: 1, speed: Speed::Auto, latency_ms: 60.0, noise: 0.05, assisted: true };
-    let drive = |seed| trajectory_csv(&run(&Track::load("random:5").unwrap(), &mut Expert, &options, seed).unwrap());
+    let options = TrialOptions { laps: 1, speed: Speed::Auto, latency_ms: 60.0, noise: 0.05, assisted: true };
+    let drive =
+        |seed| trajectory_csv(&run_trial(&Track::load("random:5").unwrap(), &mut Expert, &options, seed).unwrap());
     assert_eq!(drive(8), drive(8));
     assert_ne!(drive(8), drive(9));
 }

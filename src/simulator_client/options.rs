@@ -1,7 +1,7 @@
 //! How the client drives, and what it reports.
 
 use super::server_url::ServerUrl;
-use crate::simulator::trial::run::Run;
+use crate::simulator::trial::outcome::Trial;
 use crate::udacity::{DecimalMark, NumberStyle};
 use crate::{Error, Result};
 
@@ -64,7 +64,7 @@ impl Default for ClientOptions {
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ClientReport {
     /// The run since the scene was last entered.
-    pub run: Run,
+    pub run: Trial,
     /// Frames, each of which can send telemetry.
     pub frames: u64,
     /// Telemetries sent with a picture.

@@ -9,13 +9,13 @@ use super::link::{LinkEvent, ServerLink};
 use super::options::{ClientOptions, ClientReport, TimeMode};
 use super::reaction::Steer;
 use crate::observer::{Observer, Progress};
-use crate::simulator::camera::eye::Eye;
+use crate::simulator::camera::front_camera::FrontCamera;
 use crate::simulator::car::dynamics::MAX_STEER_DEG;
 use crate::simulator::car::expert::pursuit;
 use crate::simulator::car::speed::{Speed, telemetry_mph};
-use crate::simulator::road::track::Track;
+use crate::simulator::track::Track;
 use crate::simulator::trial::closed_loop::ClosedLoop;
-use crate::simulator::trial::run::{Run, RunOptions};
+use crate::simulator::trial::outcome::{Trial, TrialOptions};
 use crate::udacity::{DecimalMark, NumberStyle, Readings, print_telemetry};
 use crate::{Error, Result};
 
@@ -70,7 +70,7 @@ struct Scene<'a> {
     options: &'a ClientOptions,
     observer: &'a mut dyn Observer<ClientEvent>,
     link: ServerLink,
-    eye: Eye<'a>,
+    eye: FrontCamera<'a>,
     /// The picture in base64.
     image: String,
     /// The simulation step of the picture.
@@ -100,7 +100,7 @@ struct Scene<'a> {
 impl<'a> Scene<'a> {
     fn new(track: &'a Track, options: &'a ClientOptions, observer: &'a mut dyn Observer<ClientEvent>) -> Scene<'a> {
         // Building the world takes a while, and the server waits for the first telemetry.
-        let eye = Eye::new(track, options.seed);
+        let eye = FrontCamera::new(track, options.seed);
         Scene {
             track,
             options,
@@ -136,8 +136,8 @@ impl<'a> Scene<'a> {
     }
 
     /// Drives from the start to the end of the run, or until the scene is left.
-    fn play(&mut self, leave_at_s: Option<f64>) -> Result<Run> {
-        let run = RunOptions {
+    fn play(&mut self, leave_at_s: Option<f64>) -> Result<Trial> {
+        let run = TrialOptions {
             laps: self.options.laps,
             speed: Speed::Fixed(self.options.start_mph),
             latency_ms: 0.0,

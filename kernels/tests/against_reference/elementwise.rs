@@ -61,6 +61,15 @@ fn activations_agree_with_the_loops() {
             reference::softsign_backward(&y, &dy, &mut expected);
             activation::softsign_backward(isa, &y, &dy, &mut actual);
             failures.compare(&format!("softsign_backward {} {len}", isa.name()), &actual, &expected, 1e-6);
+
+            let (mut expected, mut actual) = (nans(len), nans(len));
+            reference::swish_forward(&x, &mut expected);
+            activation::swish_forward(isa, &x, &mut actual);
+            failures.compare(&format!("swish_forward {} {len}", isa.name()), &actual, &expected, 1e-6);
+            let (mut expected, mut actual) = (nans(len), nans(len));
+            reference::swish_backward(&x, &dy, &mut expected);
+            activation::swish_backward(isa, &x, &dy, &mut actual);
+            failures.compare(&format!("swish_backward {} {len}", isa.name()), &actual, &expected, 1e-6);
         }
     }
     failures.report();

@@ -1,25 +1,28 @@
 //! Batch normalisation.
 
-use steersman_kernels::Isa;
+use serde::{Deserialize, Serialize};
 use steersman_kernels::norm;
+use steersman_kernels::{Backend, Isa};
 
-use super::{BatchStatistics, Grads, Layer, Pair, ParamSpec, Pass};
+use super::{BatchStatistics, ExportForm, Family, Grads, Layer, LayerKind, Pair, ParamSpec, Pass, ReceptiveField};
 use crate::engine::tensor::Shape;
 
 /// Batch normalisation of each channel (Ioffe and Szegedy 2015).
 ///
-/// **Training** `y = gamma · (x − mean) / √(variance + epsilon) + beta` with the mean and the population variance of the
-/// channel over all images and positions of the batch; the running statistics move by
-/// `running = running_old_weight · running + (1 − running_old_weight) · batch`. **Backward** needs x; mean and variance
-/// depend on x too: `dx = gamma / √(variance + ε) · (dy − mean(dy) − x̂ · mean(dy · x̂))`, `dgamma = Σ dy · x̂`,
-/// `dbeta = Σ dy`. **Evaluation** uses the running statistics. After a dense layer each unit is a channel.
+/// - **Forward** `y = gamma · x̂ + beta` with `x̂ = (x − mean) / √(variance + epsilon)`; mean and population variance are those of
+///   the channel over all images and positions of the batch.
+/// - **Backward** of `y = gamma · x̂ + beta`, where mean and variance depend on x too:
+///   `dx = gamma / √(variance + epsilon) · (dy − mean(dy) − x̂ · mean(dy · x̂))`, `dgamma = Σ dy · x̂`, `dbeta = Σ dy`. Needs x.
+/// - **Training** moves the running statistics: `running = running_old_weight · running + (1 − running_old_weight) · batch`.
+///   The running variance keeps the population variance (divided by N, as in Keras 1, not by N − 1). **Evaluation** takes the
+///   running statistics as mean and variance. A frozen layer does so in training too; they do not depend on x, so
+///   `dx = gamma / √(variance + epsilon) · dy`.
+/// - **Limits** The whole batch must be seen before any output exists: [`BatchStatistics`] is that barrier. After a dense layer
+///   each unit is a channel.
 ///
-/// The running variance keeps the population variance (divided by N, as in Keras 1, not by N − 1).
+/// # Shapes
 ///
-/// Frozen, it computes with the running statistics in training too, which then do not depend on x: `dx = gamma /
-/// √(variance + ε) · dy`.
-///
-/// Parameters: `gamma` and `beta` `[c]`; statistics: `running_mean` and `running_variance` `[c]`.
+/// x, y, dx, dy: `[n][c][h][w]`. Parameters: `gamma`, `beta` `[c]`; statistics: `running_mean`, `running_variance` `[c]`.
 #[derive(Clone, Debug)]
 pub struct BatchNorm {
     shape: Shape,
@@ -216,6 +219,61 @@ impl BatchStatistics for BatchNorm {
             moments[5 * c + i] = (sums[c + i] / count) as f32;
             moments[6 * c + i] = params[i] * moments[c + i];
         }
+    }
+}
+
+/// Options of [`BatchNorm`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct BatchNormSpec {
+    /// Added to the variance.
+    #[serde(default = "default_epsilon")]
+    pub epsilon: f32,
+    /// Weight of the old value when the running statistics are updated (Keras' `momentum`).
+    #[serde(default = "default_running_old_weight")]
+    pub running_old_weight: f32,
+}
+
+fn default_epsilon() -> f32 {
+    1e-3
+}
+
+fn default_running_old_weight() -> f32 {
+    0.99
+}
+
+impl LayerKind for BatchNormSpec {
+    fn base_name(&self) -> &'static str {
+        "bn"
+    }
+
+    fn describe(&self) -> String {
+        "batch norm".into()
+    }
+
+    fn family(&self) -> Family {
+        Family::Normalization
+    }
+
+    fn receptive_field(&self, _input: Shape) -> ReceptiveField {
+        ReceptiveField::Element
+    }
+
+    fn check(&self, _input: Shape) -> Result<(), String> {
+        Ok(())
+    }
+
+    fn layer(&self, input: Shape, backend: Backend) -> Result<Box<dyn Layer>, String> {
+        Ok(Box::new(BatchNorm::new(input, self.epsilon, self.running_old_weight, backend.isa)?))
+    }
+
+    fn export_form(&self, _input: Shape, params: &[f32], statistics: &[f32]) -> ExportForm {
+        let halves = |values: &[f32]| {
+            let (a, b) = values.split_at(values.len() / 2);
+            (a.to_vec(), b.to_vec())
+        };
+        let ((gamma, beta), (mean, variance)) = (halves(params), halves(statistics));
+        ExportForm::BatchNorm { gamma, beta, mean, variance, epsilon: self.epsilon }
     }
 }
 

@@ -4,7 +4,11 @@ use serde::{Deserialize, Serialize};
 use steersman_kernels::Backend;
 use steersman_kernels::conv::{Conv, ConvShape};
 
-use super::{Grads, Layer, Linear, Pair, ParamSpec, Pass, Prepared};
+use super::export_form::weight_and_bias;
+use super::kind::{MAX_NUMBERS, check_first_value, check_sizes, pair};
+use super::{
+    ExportForm, Family, Grads, Layer, LayerKind, Linear, Packing, Pads, Pair, ParamSpec, Pass, ReceptiveField,
+};
 use crate::engine::tensor::{Fans, Initializer, Shape};
 
 /// What lies beyond the border of the image.
@@ -32,14 +36,19 @@ impl Padding {
     }
 }
 
-/// 2-D convolution with bias (a cross-correlation, as in every framework).
+/// 2-D convolution with bias (a cross-correlation, as in every framework), for stride s and padding p.
 ///
-/// **Forward** `y[o][i][j] = bias[o] + Σ_{c,k,l} weight[o][c][k][l] · x[c][i·s + k − p][j·s + l − p]`.
-/// **Backward** needs x: `dweight = Σ_{i,j} dy[o][i][j] · x[c][i·s + k − p][j·s + l − p]`, `dbias = Σ dy`, and `dx` is the
-/// convolution of the (spread, padded) `dy` with the kernel turned by 180°.
-/// Training and evaluation are the same. Any kernel size and stride.
+/// - **Forward** `y[o][i][j] = bias[o] + Σ_{c,k,l} weight[o][c][k][l] · x[c][i·s + k − p][j·s + l − p]`; x is 0 outside the map.
+/// - **Backward** of `y[o][i][j] = bias[o] + Σ weight[o][c][k][l] · x[c][i·s + k − p][j·s + l − p]`:
+///   `dx[c][i·s + k − p][j·s + l − p] += weight[o][c][k][l] · dy[o][i][j]`,
+///   `dweight[o][c][k][l] = Σ_{i,j} dy[o][i][j] · x[c][i·s + k − p][j·s + l − p]` and `dbias[o] = Σ_{i,j} dy[o][i][j]`. Needs x.
+/// - **Training and evaluation** are the same.
+/// - **Limits** Any kernel and stride; the padded input must hold the kernel once. At most 2²⁶ weights, and as many outputs an image.
 ///
-/// Parameters: `weight` `[filters][channels][kernel height][kernel width]`, `bias` `[filters]`.
+/// # Shapes
+///
+/// x, dx: `[n][channels][h][w]`; y, dy: `[n][filters][out_h][out_w]`, see [`Padding`]. Parameters: `weight`
+/// `[filters][channels][kernel height][kernel width]`, `bias` `[filters]`.
 #[derive(Clone, Debug)]
 pub struct Conv2d {
     conv: Conv,
@@ -95,9 +104,9 @@ impl Conv2d {
         params.split_at(self.weight_len())
     }
 
-    /// What is prepared for the forward pass and for the input gradient, if anything is.
-    fn split_prepared<'a>(&self, prepared: &'a [f32]) -> Option<(&'a [f32], &'a [f32])> {
-        (!prepared.is_empty()).then(|| prepared.split_at(self.conv.packed_len()))
+    /// What is packed for the forward pass and for the input gradient, if anything is.
+    fn split_packed<'a>(&self, packed: &'a [f32]) -> Option<(&'a [f32], &'a [f32])> {
+        (!packed.is_empty()).then(|| packed.split_at(self.conv.packed_len()))
     }
 
     fn weight_len(&self) -> usize {
@@ -134,8 +143,8 @@ impl Layer for Conv2d {
     }
 
     fn forward(&self, params: &[f32], pass: &Pass, n: usize, x: &[f32], y: &mut [f32], scratch: &mut [f32]) {
-        match self.split_prepared(pass.prepared) {
-            Some((prepared, _)) => self.conv.forward_packed(n, x, prepared, y, scratch),
+        match self.split_packed(pass.packed) {
+            Some((packed, _)) => self.conv.forward_packed(n, x, packed, y, scratch),
             None => self.infer(params, &[], n, x, y, scratch),
         }
     }
@@ -148,7 +157,7 @@ impl Layer for Conv2d {
         }
     }
 
-    fn prepared(&self) -> Option<&dyn Prepared> {
+    fn packing(&self) -> Option<&dyn Packing> {
         Some(self)
     }
 
@@ -157,45 +166,121 @@ impl Layer for Conv2d {
     }
 }
 
-impl Prepared for Conv2d {
-    fn prepared_len(&self) -> usize {
+impl Packing for Conv2d {
+    fn packed_len(&self) -> usize {
         self.conv.packed_len()
     }
 
-    fn prepare(&self, params: &[f32], prepared: &mut [f32]) {
+    fn pack(&self, params: &[f32], packed: &mut [f32]) {
         let (weight, bias) = self.split(params);
-        self.conv.pack(weight, bias, prepared);
+        self.conv.pack(weight, bias, packed);
     }
 
-    fn prepared_for_training_len(&self) -> usize {
+    fn training_packed_len(&self) -> usize {
         self.conv.packed_len() + self.conv.packed_gradient_len()
     }
 
-    fn prepare_for_training(&self, params: &[f32], prepared: &mut [f32]) {
-        let (forward, gradient) = prepared.split_at_mut(self.conv.packed_len());
+    fn pack_for_training(&self, params: &[f32], packed: &mut [f32]) {
+        let (forward, gradient) = packed.split_at_mut(self.conv.packed_len());
         let (weight, bias) = self.split(params);
         self.conv.pack(weight, bias, forward);
         self.conv.pack_gradient(weight, gradient);
     }
 
-    fn infer_prepared(&self, prepared: &[f32], n: usize, x: &[f32], y: &mut [f32], scratch: &mut [f32]) {
-        self.conv.forward_packed(n, x, prepared, y, scratch);
+    fn infer_packed(&self, packed: &[f32], n: usize, x: &[f32], y: &mut [f32], scratch: &mut [f32]) {
+        self.conv.forward_packed(n, x, packed, y, scratch);
     }
 }
 
 impl Linear for Conv2d {
     fn backward_input(&self, params: &[f32], pass: &Pass, n: usize, dy: &[f32], dx: &mut [f32], scratch: &mut [f32]) {
-        match self.split_prepared(pass.prepared) {
-            Some((_, prepared)) => self.conv.backward_input_packed(n, dy, prepared, dx, scratch),
+        match self.split_packed(pass.packed) {
+            Some((_, packed)) => self.conv.backward_input_packed(n, dy, packed, dx, scratch),
             None => self.conv.backward_input(n, dy, &params[..self.weight_len()], dx, scratch),
         }
     }
 }
 
+/// Options of [`Conv2d`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Conv2dSpec {
+    /// Output channels.
+    pub filters: usize,
+    /// Height and width of the kernel.
+    pub kernel: [usize; 2],
+    /// Rows and columns from one window to the next.
+    #[serde(default = "one_by_one", skip_serializing_if = "is_one_by_one")]
+    pub stride: [usize; 2],
+    /// `valid` (default) or `same`.
+    #[serde(default)]
+    pub padding: Padding,
+    /// First weights: `glorot_uniform` (default), `he_normal` or `{ constant = … }`.
+    #[serde(default)]
+    pub init: Initializer,
+}
+
+fn one_by_one() -> [usize; 2] {
+    [1, 1]
+}
+
+fn is_one_by_one(stride: &[usize; 2]) -> bool {
+    *stride == [1, 1]
+}
+
+impl LayerKind for Conv2dSpec {
+    fn base_name(&self) -> &'static str {
+        "conv"
+    }
+
+    fn describe(&self) -> String {
+        let stride = if self.stride == [1, 1] { String::new() } else { format!(" stride {}", pair(self.stride)) };
+        let padding = if self.padding == Padding::Same { " same" } else { "" };
+        format!("conv {}{stride}{padding}", pair(self.kernel))
+    }
+
+    fn family(&self) -> Family {
+        Family::Convolution
+    }
+
+    fn receptive_field(&self, input: Shape) -> ReceptiveField {
+        let Conv2dSpec { kernel, stride, padding, .. } = *self;
+        let before = |size, axis: usize| padding.amounts(size, kernel[axis], stride[axis]).0 as isize;
+        ReceptiveField::Window { size: kernel, stride, before: [before(input.h, 0), before(input.w, 1)] }
+    }
+
+    fn check(&self, input: Shape) -> Result<(), String> {
+        let Conv2dSpec { filters, kernel: [kh, kw], stride: [sh, sw], init, .. } = *self;
+        let weights = filters.saturating_mul(input.c).saturating_mul(kh).saturating_mul(kw);
+        let outputs = filters.saturating_mul(input.positions());
+        if weights.max(outputs) > MAX_NUMBERS {
+            return Err(format!("weights or outputs would be more than {MAX_NUMBERS} numbers"));
+        }
+        check_sizes(&[("filters", filters), ("kernel", kh), ("kernel", kw), ("stride", sh), ("stride", sw)])?;
+        match init {
+            Initializer::Constant(value) => check_first_value(value),
+            Initializer::GlorotUniform | Initializer::HeNormal => Ok(()),
+        }
+    }
+
+    fn layer(&self, input: Shape, backend: Backend) -> Result<Box<dyn Layer>, String> {
+        let Conv2dSpec { filters, kernel, stride, padding, init } = *self;
+        Ok(Box::new(Conv2d::new(input, filters, kernel, stride, padding, init, backend)?))
+    }
+
+    fn export_form(&self, input: Shape, params: &[f32], _statistics: &[f32]) -> ExportForm {
+        let Conv2dSpec { filters, kernel, stride, padding, .. } = *self;
+        let (top, bottom) = padding.amounts(input.h, kernel[0], stride[0]);
+        let (left, right) = padding.amounts(input.w, kernel[1], stride[1]);
+        let (weight, bias) = weight_and_bias(params, filters);
+        ExportForm::Conv { kernel, stride, pads: Pads { top, left, bottom, right }, weight, bias }
+    }
+}
+
 #[cfg(test)]
 mod tests {
-    use steersman_kernels::Isa;
     use steersman_kernels::conv::ConvAlgorithm;
+    use steersman_kernels::{Backend, Isa};
 
     use super::super::gradcheck::check_layer;
     use super::*;

@@ -1,12 +1,23 @@
 //! Cutting the border off inside the network.
 
-use super::{Grads, Layer, Pair, Pass};
+use serde::{Deserialize, Serialize};
+use steersman_kernels::Backend;
+
+use super::kind::check_sizes;
+use super::{ExportForm, Family, Grads, Layer, LayerKind, Pair, Pass, ReceptiveField};
 use crate::engine::tensor::Shape;
 
 /// Cuts rows and columns off (Keras' `Cropping2D`).
 ///
-/// **Forward** copies what is kept. **Backward** `dx` is `dy` where it was kept, and 0 elsewhere.
-/// Training and evaluation are the same.
+/// - **Forward** `y[c][i][j] = x[c][i + top][j + left]`.
+/// - **Backward** of `y[c][i][j] = x[c][i + top][j + left]`: `dx[c][i + top][j + left] = dy[c][i][j]`, and `dx = 0` where x was cut
+///   off. Needs nothing.
+/// - **Training and evaluation** are the same.
+/// - **Limits** At least one row and one column must be left.
+///
+/// # Shapes
+///
+/// x, dx: `[n][c][h][w]`; y, dy: `[n][c][h − top − bottom][w − left − right]`.
 #[derive(Debug)]
 pub struct Crop {
     input: Shape,
@@ -63,6 +74,50 @@ impl Layer for Crop {
         for (from, to) in self.rows(n) {
             dx[from..from + width].copy_from_slice(&pair.dy[to..to + width]);
         }
+    }
+}
+
+/// Options of [`Crop`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CropSpec {
+    /// Rows cut off at the top and at the bottom.
+    #[serde(default)]
+    pub rows: [usize; 2],
+    /// Columns cut off on the left and on the right.
+    #[serde(default)]
+    pub columns: [usize; 2],
+}
+
+impl LayerKind for CropSpec {
+    fn base_name(&self) -> &'static str {
+        "crop"
+    }
+
+    fn describe(&self) -> String {
+        "crop".into()
+    }
+
+    fn family(&self) -> Family {
+        Family::Rearrangement
+    }
+
+    fn receptive_field(&self, _input: Shape) -> ReceptiveField {
+        let before = [-(self.rows[0] as isize), -(self.columns[0] as isize)];
+        ReceptiveField::Window { size: [1, 1], stride: [1, 1], before }
+    }
+
+    fn check(&self, _input: Shape) -> Result<(), String> {
+        let sizes = [self.rows, self.columns].concat();
+        check_sizes(&sizes.into_iter().map(|size| ("rows and columns", size)).collect::<Vec<_>>())
+    }
+
+    fn layer(&self, input: Shape, _backend: Backend) -> Result<Box<dyn Layer>, String> {
+        Ok(Box::new(Crop::new(input, self.rows, self.columns)?))
+    }
+
+    fn export_form(&self, _input: Shape, _params: &[f32], _statistics: &[f32]) -> ExportForm {
+        ExportForm::Crop { top: self.rows[0], left: self.columns[0] }
     }
 }
 

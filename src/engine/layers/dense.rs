@@ -1,18 +1,25 @@
 //! Fully connected layer.
 
-use steersman_kernels::Isa;
+use serde::{Deserialize, Serialize};
 use steersman_kernels::gemm::{gemm, gemm_scratch_len};
 use steersman_kernels::matrix::{Matrix, MatrixMut};
+use steersman_kernels::{Backend, Isa};
 
-use super::{Grads, Layer, Linear, Pair, ParamSpec, Pass};
+use super::export_form::weight_and_bias;
+use super::kind::{MAX_NUMBERS, check_first_value, check_sizes};
+use super::{ExportForm, Family, Grads, Layer, LayerKind, Linear, Pair, ParamSpec, Pass, ReceptiveField};
 use crate::engine::tensor::{Fans, Initializer, Shape};
 
 /// Fully connected layer with bias.
 ///
-/// **Forward** `y = W·x + b`. **Backward** needs x: `dW = dy·xᵀ`, `db = dy`, `dx = Wᵀ·dy`.
-/// Training and evaluation are the same. The input is taken as a vector in the order channel, row, column.
+/// - **Forward** `y = W·x + b`.
+/// - **Backward** of `y = W·x + b`: `dx = Wᵀ·dy`, `dW = Σ dy·xᵀ` and `db = Σ dy` over the images. Needs x.
+/// - **Training and evaluation** are the same.
+/// - **Limits** At most 2²⁶ weights. A map is taken as a vector in the order channel, row, column.
 ///
-/// Parameters: `weight` `[units][inputs]`, `bias` `[units]`.
+/// # Shapes
+///
+/// x, dx: `[n][inputs]`; y, dy: `[n][units]`. Parameters: `weight` (W) `[units][inputs]`, `bias` (b) `[units]`.
 #[derive(Debug)]
 pub struct Dense {
     inputs: usize,
@@ -100,6 +107,56 @@ impl Linear for Dense {
         let weight = &params[..inputs * units];
         let (dy, weight) = (Matrix::new(dy, n, units), Matrix::new(weight, units, inputs));
         gemm(self.isa, 1.0, dy, weight, 0.0, MatrixMut::new(dx, n, inputs), scratch);
+    }
+}
+
+/// Options of [`Dense`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DenseSpec {
+    /// Outputs.
+    pub units: usize,
+    /// First weights: `glorot_uniform` (default), `he_normal` or `{ constant = … }`.
+    #[serde(default)]
+    pub init: Initializer,
+}
+
+impl LayerKind for DenseSpec {
+    fn base_name(&self) -> &'static str {
+        "dense"
+    }
+
+    fn describe(&self) -> String {
+        "dense".into()
+    }
+
+    fn family(&self) -> Family {
+        Family::Dense
+    }
+
+    fn receptive_field(&self, _input: Shape) -> ReceptiveField {
+        ReceptiveField::All
+    }
+
+    fn check(&self, input: Shape) -> Result<(), String> {
+        let units = self.units;
+        if units.saturating_mul(input.len()) > MAX_NUMBERS {
+            return Err(format!("{units} units would have more than {MAX_NUMBERS} weights"));
+        }
+        check_sizes(&[("units", units)])?;
+        match self.init {
+            Initializer::Constant(value) => check_first_value(value),
+            Initializer::GlorotUniform | Initializer::HeNormal => Ok(()),
+        }
+    }
+
+    fn layer(&self, input: Shape, backend: Backend) -> Result<Box<dyn Layer>, String> {
+        Ok(Box::new(Dense::new(input, self.units, self.init, backend.isa)?))
+    }
+
+    fn export_form(&self, _input: Shape, params: &[f32], _statistics: &[f32]) -> ExportForm {
+        let (weight, bias) = weight_and_bias(params, self.units);
+        ExportForm::Dense { weight, bias }
     }
 }
 

@@ -1,18 +1,24 @@
 //! Dropout.
 
 use rand::Rng;
+use serde::{Deserialize, Serialize};
+use steersman_kernels::Backend;
 
-use super::{Grads, Layer, Pair, Pass};
+use super::{ExportForm, Family, Grads, Layer, LayerKind, Pair, Pass, ReceptiveField};
 use crate::engine::random::{Purpose, rng};
 use crate::engine::tensor::Shape;
 
-/// Inverted dropout (Srivastava et al. 2014).
+/// Inverted dropout (Srivastava et al. 2014), with p = `drop_probability`.
 ///
-/// **Training** drops each element with `drop_probability` and multiplies the kept ones by `1 / (1 − drop_probability)`,
-/// so that the expected output is the input. **Backward** does the same to the gradient. **Evaluation** is the identity.
+/// - **Forward** `y = x · mask / (1 − p)`; each value of `mask` is 0 with probability p, else 1. So y has the mean of x.
+/// - **Backward** of `y = x · mask / (1 − p)`: `dx = dy · mask / (1 − p)`. Needs the mask, and draws it again: it follows from
+///   (seed, step, layer, image) alone, so nothing is kept, and the way a batch is cut into shards changes nothing.
+/// - **Training** draws a new mask for each step; **evaluation** is `y = x`.
+/// - **Limits** p lies in [0, 1).
 ///
-/// What is dropped follows from (seed, step, layer, image) alone, so the backward pass draws it again instead of keeping
-/// it.
+/// # Shapes
+///
+/// x, y, dx, dy: `[n][c][h][w]`.
 #[derive(Debug)]
 pub struct Dropout {
     shape: Shape,
@@ -70,13 +76,51 @@ impl Layer for Dropout {
     }
 }
 
+/// Options of [`Dropout`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DropoutSpec {
+    /// Fraction that is dropped, in [0, 1).
+    pub drop_probability: f32,
+}
+
+impl LayerKind for DropoutSpec {
+    fn base_name(&self) -> &'static str {
+        "dropout"
+    }
+
+    fn describe(&self) -> String {
+        format!("dropout {}", self.drop_probability)
+    }
+
+    fn family(&self) -> Family {
+        Family::Regularization
+    }
+
+    fn receptive_field(&self, _input: Shape) -> ReceptiveField {
+        ReceptiveField::Element
+    }
+
+    fn check(&self, _input: Shape) -> Result<(), String> {
+        Ok(())
+    }
+
+    fn layer(&self, input: Shape, _backend: Backend) -> Result<Box<dyn Layer>, String> {
+        Ok(Box::new(Dropout::new(input, self.drop_probability)?))
+    }
+
+    fn export_form(&self, _input: Shape, _params: &[f32], _statistics: &[f32]) -> ExportForm {
+        ExportForm::Identity
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::super::gradcheck::check_layer;
     use super::*;
 
     fn pass(step: u64, layer: usize, first_image: usize) -> Pass<'static> {
-        Pass { seed: 1, step, layer, first_image, moments: &[], prepared: &[] }
+        Pass { seed: 1, step, layer, first_image, moments: &[], packed: &[] }
     }
 
     fn drop(layer: &Dropout, pass: &Pass, x: &[f32]) -> Vec<f32> {

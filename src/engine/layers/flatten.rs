@@ -1,11 +1,20 @@
 //! From a map to a vector.
 
-use super::{Grads, Layer, Pair, Pass};
+use serde::{Deserialize, Serialize};
+use steersman_kernels::Backend;
+
+use super::{ExportForm, Family, Grads, Layer, LayerKind, Pair, Pass, ReceptiveField};
 use crate::engine::tensor::Shape;
 
-/// The map as a vector, in the order channel, row, column (Keras' order is row, column, channel).
+/// A map as a vector, in the order channel, row, column. (Keras' order is row, column, channel.)
 ///
-/// The numbers stay where they are; all passes are copies, and a planned network leaves even those out.
+/// - **Forward** `y[(c · h + i) · w + j] = x[c][i][j]`: the values stay where they are. A planned network skips the layer.
+/// - **Backward** of `y[(c · h + i) · w + j] = x[c][i][j]`: `dx[c][i][j] = dy[(c · h + i) · w + j]`. Needs nothing.
+/// - **Training and evaluation** are the same.
+///
+/// # Shapes
+///
+/// x, dx: `[n][c][h][w]`; y, dy: `[n][c · h · w]`.
 #[derive(Debug)]
 pub struct Flatten {
     input: Shape,
@@ -43,6 +52,41 @@ impl Layer for Flatten {
         if let Some(dx) = dx {
             dx.copy_from_slice(pair.dy);
         }
+    }
+}
+
+/// Options of [`Flatten`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FlattenSpec {}
+
+impl LayerKind for FlattenSpec {
+    fn base_name(&self) -> &'static str {
+        "flatten"
+    }
+
+    fn describe(&self) -> String {
+        "flatten".into()
+    }
+
+    fn family(&self) -> Family {
+        Family::Rearrangement
+    }
+
+    fn receptive_field(&self, _input: Shape) -> ReceptiveField {
+        ReceptiveField::All
+    }
+
+    fn check(&self, _input: Shape) -> Result<(), String> {
+        Ok(())
+    }
+
+    fn layer(&self, input: Shape, _backend: Backend) -> Result<Box<dyn Layer>, String> {
+        Ok(Box::new(Flatten::new(input)))
+    }
+
+    fn export_form(&self, _input: Shape, _params: &[f32], _statistics: &[f32]) -> ExportForm {
+        ExportForm::Flatten
     }
 }
 

@@ -81,7 +81,7 @@ impl<'a> Harness<'a> {
             barrier.forward_sums(self.n, &self.x, &mut self.sums);
             barrier.finish_forward(&self.params, self.n, &self.sums, &mut self.moments, &mut self.statistics);
         }
-        let pass = Pass { seed: 1, step: 2, layer: 3, first_image: 0, moments: &self.moments, prepared: &[] };
+        let pass = Pass { seed: 1, step: 2, layer: 3, first_image: 0, moments: &self.moments, packed: &[] };
         self.layer.forward(&self.params, &pass, self.n, &self.x, &mut self.y, &mut self.scratch);
     }
 
@@ -91,7 +91,7 @@ impl<'a> Harness<'a> {
             barrier.backward_sums(&self.moments, self.n, &self.x, &self.dy, &mut self.sums, &mut self.dparams);
             barrier.finish_backward(&self.params, self.n, &self.sums, &mut self.moments);
         }
-        let pass = Pass { seed: 1, step: 2, layer: 3, first_image: 0, moments: &self.moments, prepared: &[] };
+        let pass = Pass { seed: 1, step: 2, layer: 3, first_image: 0, moments: &self.moments, packed: &[] };
         let pair = Pair { x: &self.x, y: &self.y, dy: &self.dy };
         let grads = Grads { dparams: &mut self.dparams, scratch: &mut self.scratch };
         self.layer.backward(&self.params, &pass, self.n, pair, Some(&mut self.dx), grads);

@@ -2,7 +2,7 @@
 //!
 //! A [`Layer`] is a description: sizes and options, no state. Parameters, activations and gradients live in buffers that
 //! [`network`](crate::engine::network) plans once, so a training step allocates nothing and threads share a network without a
-//! lock. Each layer works on a few images at a time (`n` of them, `[n][c][h][w]`), on one thread.
+//! lock. Each call of a layer works on `n` images, `[n][c][h][w]`, on one thread.
 //!
 //! # Training and evaluation
 //!
@@ -12,14 +12,23 @@
 //!
 //! # To add a layer
 //!
-//! 1. If it computes something new, write the kernel in `kernels/`, with its naive loop in `kernels/src/reference.rs` and a
-//!    case in `kernels/tests/against_reference.rs`.
-//! 2. Write `src/engine/layers/your_layer.rs`: a struct that implements [`Layer`], and gradient checks with
-//!    [`gradcheck::check_layer`] below it (odd sizes, batch 1). Add the `mod` and `pub use` lines here.
-//! 3. Add an arm to [`LayerSpec`](crate::engine::network::LayerSpec): its options, its base name and `build`.
-//! 4. Spoil a gradient on purpose and see the check fail; then add a row to `benches/layers.rs`.
+//! [`Swish`] shows each place.
 //!
-//! Nothing else has to know: recipes, summaries, model files and the optimizer go by [`ParamSpec`].
+//! 1. **Kernel and reference**, if the layer computes something new: the loop in `kernels/src/` (`activation.rs`), the same as a
+//!    naive loop in double precision in `kernels/src/reference.rs`.
+//! 2. **Kernel test**: the two against each other, in `kernels/tests/against_reference/` (`elementwise.rs`).
+//! 3. **Layer**: a file of its own in this folder, with its `mod` and `pub use` lines. It holds the layer, which implements
+//!    [`Layer`]; its options, which implement [`LayerKind`] (what it is called, sees, and exports); and a gradient check
+//!    with [`gradcheck::check_layer`] (odd sizes, batch 1). Spoil a gradient on purpose and see the check fail.
+//! 4. **Spec entry**: one line in `network/spec.rs`, the `kind` of recipes with an example. The tests there hold each entry against
+//!    its layer by [`check_kind`].
+//! 5. **Documentation**: the `layers` entry in `data/README.md`, and CHANGELOG.
+//! 6. If Keras has it, **the Keras reader**: an arm in `exchange/keras/translate.rs`.
+//!
+//! Nothing else has to know. Recipes, summaries, model files and the optimizer go by [`ParamSpec`]; ONNX, C and Rust exports by
+//! [`ExportForm`]; saliency, feature maps and diagrams by [`ReceptiveField`] and [`Family`]; `benches/layers.rs` runs every spec
+//! entry. Forgetting 1 or 3 does not compile; forgetting 2, 4, 5 or an answer of [`LayerKind`] that is not true fails a test or leaves
+//! the layer without a name in recipes. `tests/new_layer.rs` follows this recipe outside the crate.
 
 mod activation;
 mod batch_norm;
@@ -27,30 +36,39 @@ mod conv2d;
 mod crop;
 mod dense;
 mod dropout;
+mod export_form;
 mod flatten;
+mod formula;
 pub mod gradcheck;
+mod kind;
+mod kind_check;
 mod norm_rectify;
 mod pool;
 mod pooled_conv;
-mod prelu;
 mod scale;
 mod zero_pad;
 
 use std::fmt::Debug;
 
-pub use activation::{Elu, LeakyRelu, Relu, Softsign, Tanh};
-pub use batch_norm::BatchNorm;
-pub use conv2d::{Conv2d, Padding};
-pub use crop::Crop;
-pub use dense::Dense;
-pub use dropout::Dropout;
-pub use flatten::Flatten;
+pub use activation::{
+    Elu, EluSpec, LeakyRelu, LeakyReluSpec, PRelu, PReluSpec, Relu, ReluSpec, Slopes, Softsign, SoftsignSpec, Swish,
+    SwishSpec, Tanh, TanhSpec,
+};
+pub use batch_norm::{BatchNorm, BatchNormSpec};
+pub use conv2d::{Conv2d, Conv2dSpec, Padding};
+pub use crop::{Crop, CropSpec};
+pub use dense::{Dense, DenseSpec};
+pub use dropout::{Dropout, DropoutSpec};
+pub use export_form::{ExportForm, Pads};
+pub use flatten::{Flatten, FlattenSpec};
+pub use formula::{Formula, Function};
+pub use kind::{Family, LayerKind, ReceptiveField};
+pub use kind_check::check_kind;
 pub use norm_rectify::NormRectify;
-pub use pool::{AveragePool, MaxPool};
+pub use pool::{AveragePool, AveragePoolSpec, MaxPool, MaxPoolSpec};
 pub use pooled_conv::{PooledConv, Rising};
-pub use prelu::{PRelu, Slopes};
-pub use scale::Scale;
-pub use zero_pad::ZeroPad;
+pub use scale::{Scale, ScaleSpec};
+pub use zero_pad::{ZeroPad, ZeroPadSpec};
 
 use crate::engine::tensor::{Fans, Initializer, Shape};
 
@@ -86,12 +104,12 @@ impl ParamSpec {
         }
     }
 
-    /// How many numbers the tensor has.
+    /// Length of the tensor.
     pub fn len(&self) -> usize {
         self.shape.iter().product()
     }
 
-    /// Whether the tensor has no numbers.
+    /// Whether the tensor is empty.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
@@ -104,26 +122,26 @@ pub struct Pass<'a> {
     pub seed: u64,
     /// Number of the training step, from 0.
     pub step: u64,
-    /// Place of the layer in the network, so that two dropout layers drop different elements.
+    /// Index of the layer in the network, so that two dropout layers drop different elements.
     pub layer: usize,
-    /// Place of the first image of `x` in the batch.
+    /// Index in the batch of the first image of `x`.
     pub first_image: usize,
-    /// What [`BatchStatistics`] has put there for this layer; empty for all others.
+    /// What the barrier of [`BatchStatistics`] computed for this layer; empty for layers without a barrier.
     pub moments: &'a [f32],
-    /// What [`Prepared::prepare_for_training`] made of the layer's parameters at the start of the step. Empty if nobody asked it
-    /// to; then the layer does so in every call.
-    pub prepared: &'a [f32],
+    /// The layer's packed weights, from [`Packing::pack_for_training`] at the start of the step. If empty, the layer packs its
+    /// weights in every call.
+    pub packed: &'a [f32],
 }
 
 /// A layer whose input shape is known.
 ///
 /// In every method `x` holds `n` images of [`input`](Layer::input), `y` holds `n` of [`output`](Layer::output), `dx` and
 /// `dy` their gradients, `params` the tensors of [`params`](Layer::params) one after the other and `dparams` their
-/// gradients. `scratch` has at least [`scratch_len`](Layer::scratch_len)`(n)` numbers of arbitrary content.
+/// gradients. `scratch` has at least [`scratch_len`](Layer::scratch_len)`(n)` elements of arbitrary content.
 ///
 /// # Panics
 ///
-/// All methods panic if a slice has another length than that.
+/// All methods panic if a slice has another length.
 pub trait Layer: Send + Sync + Debug {
     /// Shape of one input image.
     fn input(&self) -> Shape;
@@ -146,13 +164,13 @@ pub trait Layer: Send + Sync + Debug {
         0
     }
 
-    /// How many numbers of scratch any method needs for `n` images.
+    /// Length of the scratch buffer that any method needs for `n` images.
     fn scratch_len(&self, n: usize) -> usize {
         let _ = n;
         0
     }
 
-    /// Whether the output is the input with another shape, so that no pass has anything to do.
+    /// Whether the output is the input with another shape. Planned networks skip such layers.
     fn is_view(&self) -> bool {
         false
     }
@@ -163,15 +181,15 @@ pub trait Layer: Send + Sync + Debug {
     /// Training: overwrites `y`.
     fn forward(&self, params: &[f32], pass: &Pass, n: usize, x: &[f32], y: &mut [f32], scratch: &mut [f32]);
 
-    /// Gradients of the loss: overwrites `dx` where it is asked for, adds to `dparams`. `x` and `y` are those of `forward`.
+    /// Gradients of the loss: overwrites `dx` if it is given, adds to `dparams`. `x` and `y` are those of `forward`.
     fn backward(&self, params: &[f32], pass: &Pass, n: usize, pair: Pair, dx: Option<&mut [f32]>, grads: Grads);
 
-    /// Evaluation with parameters prepared for it, for layers that gain by that.
-    fn prepared(&self) -> Option<&dyn Prepared> {
+    /// Packed weights, for layers that compute faster with them.
+    fn packing(&self) -> Option<&dyn Packing> {
         None
     }
 
-    /// The input gradient by itself, for layers that find it from `dy` and the parameters alone.
+    /// The input gradient by itself, for layers that compute it from `dy` and the parameters alone.
     fn linear(&self) -> Option<&dyn Linear> {
         None
     }
@@ -182,7 +200,7 @@ pub trait Layer: Send + Sync + Debug {
     }
 }
 
-/// What [`Layer::backward`] reads: what went in and out, and the gradient of what came out.
+/// What [`Layer::backward`] reads: input and output of the forward pass, and the gradient of the output.
 #[derive(Clone, Copy, Debug)]
 pub struct Pair<'a> {
     /// Input of the forward pass.
@@ -198,66 +216,66 @@ pub struct Pair<'a> {
 pub struct Grads<'a> {
     /// Gradient of the loss with respect to the parameters; added to.
     pub dparams: &'a mut [f32],
-    /// Working space.
+    /// Scratch buffer of [`Layer::scratch_len`] elements.
     pub scratch: &'a mut [f32],
 }
 
-/// A layer that reads its parameters in another order than they are kept in: one for evaluation, and one for training, where the
-/// input gradient needs them too.
+/// Packed weights: a layer's parameters in the order in which its kernels read them, packed once and used for many images.
+///
+/// Evaluation needs the weights of the forward pass, training those of the input gradient too.
 ///
 /// # Panics
 ///
-/// Methods panic if `prepared` has another length than is said here, or was prepared for the other purpose and so has.
-pub trait Prepared {
-    /// How many numbers the prepared parameters are.
-    fn prepared_len(&self) -> usize;
+/// Methods panic if `packed` has another length than is said here, as weights packed for the other purpose have.
+pub trait Packing {
+    /// Length of the weights packed for evaluation.
+    fn packed_len(&self) -> usize;
 
-    /// Overwrites `prepared`.
-    fn prepare(&self, params: &[f32], prepared: &mut [f32]);
+    /// Packs `params` for evaluation: overwrites `packed`.
+    fn pack(&self, params: &[f32], packed: &mut [f32]);
 
-    /// How many numbers the parameters prepared for training are.
-    fn prepared_for_training_len(&self) -> usize;
+    /// Length of the weights packed for training.
+    fn training_packed_len(&self) -> usize;
 
-    /// Overwrites `prepared` with what [`Pass::prepared`] is to be.
-    fn prepare_for_training(&self, params: &[f32], prepared: &mut [f32]);
+    /// Packs `params` for training: overwrites `packed`, which becomes [`Pass::packed`].
+    fn pack_for_training(&self, params: &[f32], packed: &mut [f32]);
 
-    /// As [`Layer::infer`], to the same bits.
-    fn infer_prepared(&self, prepared: &[f32], n: usize, x: &[f32], y: &mut [f32], scratch: &mut [f32]);
+    /// [`Layer::infer`] with packed weights, to the same bits.
+    fn infer_packed(&self, packed: &[f32], n: usize, x: &[f32], y: &mut [f32], scratch: &mut [f32]);
 }
 
-/// A layer whose input gradient needs neither input nor output, so that it may take the place of the input once
-/// [`Layer::backward`] has found the gradients of the parameters.
+/// A layer whose input gradient needs neither input nor output. So `dx` may overwrite the buffer of `x` once
+/// [`Layer::backward`] has computed the gradients of the parameters.
 pub trait Linear {
     /// Overwrites `dx`, as [`Layer::backward`] does.
     fn backward_input(&self, params: &[f32], pass: &Pass, n: usize, dy: &[f32], dx: &mut [f32], scratch: &mut [f32]);
 }
 
-/// The barrier of a layer that looks at the whole batch at once (batch normalisation).
+/// The barrier of a layer that needs sums over the whole batch (batch normalisation).
 ///
-/// Forward: [`forward_sums`](Self::forward_sums) on every part of the batch, the sums added up in a fixed order,
-/// [`finish_forward`](Self::finish_forward) once, then [`Layer::forward`] on every part. Backward likewise.
+/// Forward: [`forward_sums`](Self::forward_sums) on each shard of the batch, the sums added in a fixed order,
+/// [`finish_forward`](Self::finish_forward) once, then [`Layer::forward`] on each shard. Backward likewise.
 pub trait BatchStatistics {
-    /// How many sums there are.
+    /// Number of sums.
     fn sums_len(&self) -> usize;
 
-    /// How many numbers `moments` has.
+    /// Length of `moments`.
     fn moments_len(&self) -> usize;
 
     /// Overwrites `sums` with the sums over the `n` images of `x`.
     fn forward_sums(&self, n: usize, x: &[f32], sums: &mut [f64]);
 
-    /// From the sums over all `images` of the batch: what [`Layer::forward`] needs into `moments`, and the running
-    /// statistics moved on.
+    /// From the sums over all `images` of the batch: overwrites the moments that [`Layer::forward`] needs and updates the running
+    /// statistics.
     fn finish_forward(&self, params: &[f32], images: usize, sums: &[f64], moments: &mut [f32], statistics: &mut [f32]);
 
-    /// What [`Layer::forward`] and [`Layer::backward`] need where the layer is frozen: it goes by its running statistics then,
-    /// as in evaluation, and needs no barrier.
+    /// Overwrites `moments` for a frozen layer: it takes its running statistics, as in evaluation, and needs no barrier.
     fn frozen_moments(&self, params: &[f32], statistics: &[f32], moments: &mut [f32]);
 
     /// Overwrites `sums` with the sums over the `n` images of `x` and `dy`, and adds the gradients of the parameters that
     /// follow from them to `dparams`.
     fn backward_sums(&self, moments: &[f32], n: usize, x: &[f32], dy: &[f32], sums: &mut [f64], dparams: &mut [f32]);
 
-    /// From the sums over all `images` of the batch: what [`Layer::backward`] needs, added to `moments`.
+    /// From the sums over all `images` of the batch: writes the moments that only [`Layer::backward`] needs.
     fn finish_backward(&self, params: &[f32], images: usize, sums: &[f64], moments: &mut [f32]);
 }

@@ -1,9 +1,11 @@
 //! Pooling.
 
-use steersman_kernels::Isa;
+use serde::{Deserialize, Serialize};
 use steersman_kernels::pool::{self, PoolShape};
+use steersman_kernels::{Backend, Isa};
 
-use super::{Grads, Layer, Pair, Pass};
+use super::kind::{check_sizes, pair};
+use super::{ExportForm, Family, Grads, Layer, LayerKind, Pair, Pass, ReceptiveField};
 use crate::engine::tensor::Shape;
 
 fn pool_shape(input: Shape, window: [usize; 2], stride: [usize; 2]) -> Result<PoolShape, String> {
@@ -17,11 +19,17 @@ fn pool_shape(input: Shape, window: [usize; 2], stride: [usize; 2]) -> Result<Po
     Ok(PoolShape { c: input.c, h: input.h, w: input.w, kh, kw, stride_h, stride_w })
 }
 
-/// Largest value of each window.
+/// The largest value of each window, for stride s.
 ///
-/// **Forward** `y[c][i][j] = max x[c][i·s + k][j·s + l]`; windows that would cross the border are left out (floor).
-/// **Backward** needs x and y: `dy` goes to the first largest element of its window, in row-major order.
-/// Training and evaluation are the same.
+/// - **Forward** `y[c][i][j] = max_{k,l} x[c][i·s + k][j·s + l]`.
+/// - **Backward** of `y[c][i][j] = max_{k,l} x[c][i·s + k][j·s + l]`: `dx += dy[c][i][j]` at the argmax, the first of equal ones in
+///   row-major order; `dx = 0` elsewhere. Needs x and y.
+/// - **Training and evaluation** are the same.
+/// - **Limits** No padding: rows and columns that do not fill a window are left out.
+///
+/// # Shapes
+///
+/// x, dx: `[n][c][h][w]`; y, dy: `[n][c][⌊(h − kh) / s⌋ + 1][⌊(w − kw) / s⌋ + 1]`.
 #[derive(Debug)]
 pub struct MaxPool {
     shape: PoolShape,
@@ -59,11 +67,17 @@ impl Layer for MaxPool {
     }
 }
 
-/// Mean of each window.
+/// The mean of each window, for stride s.
 ///
-/// **Forward** `y[c][i][j] = mean x[c][i·s + k][j·s + l]`; windows that would cross the border are left out (floor).
-/// **Backward** needs nothing: each element of a window gets `dy / window size`.
-/// Training and evaluation are the same.
+/// - **Forward** `y[c][i][j] = Σ_{k,l} x[c][i·s + k][j·s + l] / (kh · kw)`.
+/// - **Backward** of `y[c][i][j] = Σ_{k,l} x[c][i·s + k][j·s + l] / (kh · kw)`: `dx[c][i·s + k][j·s + l] += dy[c][i][j] / (kh · kw)`.
+///   Needs nothing.
+/// - **Training and evaluation** are the same.
+/// - **Limits** No padding: rows and columns that do not fill a window are left out.
+///
+/// # Shapes
+///
+/// x, dx: `[n][c][h][w]`; y, dy: `[n][c][⌊(h − kh) / s⌋ + 1][⌊(w − kw) / s⌋ + 1]`.
 #[derive(Debug)]
 pub struct AveragePool {
     shape: PoolShape,
@@ -101,6 +115,101 @@ impl Layer for AveragePool {
     }
 }
 
+/// Options of [`MaxPool`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct MaxPoolSpec {
+    /// Height and width of the window.
+    pub window: [usize; 2],
+    /// Rows and columns from one window to the next; the window's size when absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub stride: Option<[usize; 2]>,
+}
+
+impl LayerKind for MaxPoolSpec {
+    fn base_name(&self) -> &'static str {
+        "pool"
+    }
+
+    fn describe(&self) -> String {
+        describe("max pool", self.window, self.stride)
+    }
+
+    fn family(&self) -> Family {
+        Family::Pooling
+    }
+
+    fn receptive_field(&self, _input: Shape) -> ReceptiveField {
+        ReceptiveField::Window { size: self.window, stride: self.stride.unwrap_or(self.window), before: [0, 0] }
+    }
+
+    fn check(&self, _input: Shape) -> Result<(), String> {
+        check(self.window, self.stride)
+    }
+
+    fn layer(&self, input: Shape, backend: Backend) -> Result<Box<dyn Layer>, String> {
+        Ok(Box::new(MaxPool::new(input, self.window, self.stride.unwrap_or(self.window), backend.isa)?))
+    }
+
+    fn export_form(&self, _input: Shape, _params: &[f32], _statistics: &[f32]) -> ExportForm {
+        ExportForm::MaxPool { window: self.window, stride: self.stride.unwrap_or(self.window) }
+    }
+}
+
+/// Options of [`AveragePool`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct AveragePoolSpec {
+    /// Height and width of the window.
+    pub window: [usize; 2],
+    /// Rows and columns from one window to the next; the window's size when absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub stride: Option<[usize; 2]>,
+}
+
+impl LayerKind for AveragePoolSpec {
+    fn base_name(&self) -> &'static str {
+        "pool"
+    }
+
+    fn describe(&self) -> String {
+        describe("average pool", self.window, self.stride)
+    }
+
+    fn family(&self) -> Family {
+        Family::Pooling
+    }
+
+    fn receptive_field(&self, _input: Shape) -> ReceptiveField {
+        ReceptiveField::Window { size: self.window, stride: self.stride.unwrap_or(self.window), before: [0, 0] }
+    }
+
+    fn check(&self, _input: Shape) -> Result<(), String> {
+        check(self.window, self.stride)
+    }
+
+    fn layer(&self, input: Shape, backend: Backend) -> Result<Box<dyn Layer>, String> {
+        Ok(Box::new(AveragePool::new(input, self.window, self.stride.unwrap_or(self.window), backend.isa)?))
+    }
+
+    fn export_form(&self, _input: Shape, _params: &[f32], _statistics: &[f32]) -> ExportForm {
+        ExportForm::AveragePool { window: self.window, stride: self.stride.unwrap_or(self.window) }
+    }
+}
+
+/// `max pool 2x2`, `max pool 3x3 stride 2x2`.
+fn describe(what: &str, window: [usize; 2], stride: Option<[usize; 2]>) -> String {
+    match stride.filter(|stride| *stride != window) {
+        None => format!("{what} {}", pair(window)),
+        Some(stride) => format!("{what} {} stride {}", pair(window), pair(stride)),
+    }
+}
+
+fn check([h, w]: [usize; 2], stride: Option<[usize; 2]>) -> Result<(), String> {
+    let [sh, sw] = stride.unwrap_or([1, 1]);
+    check_sizes(&[("window", h), ("window", w), ("stride", sh), ("stride", sw)])
+}
+
 #[cfg(test)]
 mod tests {
     use super::super::gradcheck::check_layer;
@@ -134,7 +243,7 @@ mod tests {
     #[test]
     fn the_first_of_equal_maxima_gets_the_gradient() {
         let layer = MaxPool::new(Shape::new(1, 2, 2), [2, 2], [2, 2], Isa::best()).unwrap();
-        let pass = Pass { seed: 0, step: 0, layer: 0, first_image: 0, moments: &[], prepared: &[] };
+        let pass = Pass { seed: 0, step: 0, layer: 0, first_image: 0, moments: &[], packed: &[] };
         let (x, y, dy, mut dx) = ([0.0, 3.0, 3.0, 1.0], [3.0], [2.0], [f32::NAN; 4]);
         let grads = Grads { dparams: &mut [], scratch: &mut [] };
         layer.backward(&[], &pass, 1, Pair { x: &x, y: &y, dy: &dy }, Some(&mut dx), grads);

@@ -4,7 +4,7 @@ use steersman_kernels::activation;
 use steersman_kernels::pool::{self, PoolShape};
 use steersman_kernels::{Isa, conv::Conv};
 
-use super::{Conv2d, Grads, Layer, Pair, Pass, Prepared};
+use super::{Conv2d, Grads, Layer, Packing, Pair, Pass};
 
 /// An activation that never falls, so that the largest of a window stays the largest.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -65,14 +65,14 @@ impl PooledConv {
     ///
     /// # Panics
     ///
-    /// If the pass has no [`Pass::prepared`]: unlike a layer, it does not prepare the weights itself.
+    /// If the pass has no [`Pass::packed`]: unlike a layer, it does not prepare the weights itself.
     pub fn forward(&self, pass: &Pass, n: usize, x: &[f32], y: &mut [f32], starts: &mut [u32], scratch: &mut [f32]) {
         let (map, scratch) = scratch.split_at_mut(self.pool.c * self.pool.h * self.pool.w);
         let (pooled, scratch) = scratch.split_at_mut(self.output_len());
         let input = self.conv.input();
         let outputs = y.chunks_exact_mut(self.output_len()).zip(starts.chunks_exact_mut(self.output_len()));
         for (x, (y, starts)) in x.chunks_exact(input.len()).zip(outputs).take(n) {
-            self.kernel().forward_packed(1, x, pass.prepared, map, scratch);
+            self.kernel().forward_packed(1, x, pass.packed, map, scratch);
             pool::max_forward_with_argmax(self.isa, &self.pool, 1, input.w, map, pooled, starts);
             self.activate(pooled, y);
         }
@@ -97,29 +97,29 @@ impl PooledConv {
 }
 
 /// Evaluation: the weights are those of the convolution.
-impl Prepared for PooledConv {
-    fn prepared_len(&self) -> usize {
-        self.conv.prepared_len()
+impl Packing for PooledConv {
+    fn packed_len(&self) -> usize {
+        self.conv.packed_len()
     }
 
-    fn prepare(&self, params: &[f32], prepared: &mut [f32]) {
-        self.conv.prepare(params, prepared);
+    fn pack(&self, params: &[f32], packed: &mut [f32]) {
+        self.conv.pack(params, packed);
     }
 
-    fn prepared_for_training_len(&self) -> usize {
-        self.conv.prepared_len()
+    fn training_packed_len(&self) -> usize {
+        self.conv.packed_len()
     }
 
-    fn prepare_for_training(&self, params: &[f32], prepared: &mut [f32]) {
-        self.conv.prepare(params, prepared);
+    fn pack_for_training(&self, params: &[f32], packed: &mut [f32]) {
+        self.conv.pack(params, packed);
     }
 
-    fn infer_prepared(&self, prepared: &[f32], n: usize, x: &[f32], y: &mut [f32], scratch: &mut [f32]) {
+    fn infer_packed(&self, packed: &[f32], n: usize, x: &[f32], y: &mut [f32], scratch: &mut [f32]) {
         let (map, scratch) = scratch.split_at_mut(self.pool.c * self.pool.h * self.pool.w);
         let (pooled, scratch) = scratch.split_at_mut(self.output_len());
         let images = x.chunks_exact(self.conv.input().len()).zip(y.chunks_exact_mut(self.output_len()));
         for (x, y) in images.take(n) {
-            self.conv.infer_prepared(prepared, 1, x, map, scratch);
+            self.conv.infer_packed(packed, 1, x, map, scratch);
             pool::max_forward(self.isa, &self.pool, 1, map, pooled);
             self.activate(pooled, y);
         }

@@ -1,11 +1,21 @@
 //! Fixed scaling inside the network.
 
-use super::{Grads, Layer, Pair, Pass};
+use serde::{Deserialize, Serialize};
+use steersman_kernels::Backend;
+
+use super::{ExportForm, Family, Formula, Grads, Layer, LayerKind, Pair, Pass, ReceptiveField};
 use crate::engine::tensor::Shape;
 
-/// Fixed scaling, the write-ups' normalisation layer.
+/// Scaling by fixed numbers: the normalisation layer at the start of many Keras networks.
 ///
-/// **Forward** `y = x · factor + offset`. **Backward** `dx = dy · factor`. Training and evaluation are the same.
+/// - **Forward** `y = x · factor + offset`.
+/// - **Backward** of `y = x · factor + offset`: `dx = dy · factor`. Needs nothing.
+/// - **Training and evaluation** are the same.
+/// - **Limits** factor and offset are finite and never trained.
+///
+/// # Shapes
+///
+/// x, y, dx, dy: `[n][c][h][w]`.
 #[derive(Debug)]
 pub struct Scale {
     shape: Shape,
@@ -49,6 +59,46 @@ impl Layer for Scale {
         for (dx, dy) in dx.iter_mut().zip(pair.dy) {
             *dx = dy * self.factor;
         }
+    }
+}
+
+/// Options of [`Scale`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ScaleSpec {
+    /// Multiplies the input.
+    pub factor: f32,
+    /// Added after that.
+    pub offset: f32,
+}
+
+impl LayerKind for ScaleSpec {
+    fn base_name(&self) -> &'static str {
+        "scale"
+    }
+
+    fn describe(&self) -> String {
+        format!("x * {} + {}", self.factor, self.offset).replace("+ -", "- ")
+    }
+
+    fn family(&self) -> Family {
+        Family::Normalization
+    }
+
+    fn receptive_field(&self, _input: Shape) -> ReceptiveField {
+        ReceptiveField::Element
+    }
+
+    fn check(&self, _input: Shape) -> Result<(), String> {
+        Ok(())
+    }
+
+    fn layer(&self, input: Shape, _backend: Backend) -> Result<Box<dyn Layer>, String> {
+        Ok(Box::new(Scale::new(input, self.factor, self.offset)?))
+    }
+
+    fn export_form(&self, _input: Shape, _params: &[f32], _statistics: &[f32]) -> ExportForm {
+        ExportForm::Elementwise(Formula::X * Formula::Number(self.factor) + Formula::Number(self.offset))
     }
 }
 

@@ -1,12 +1,22 @@
 //! Zeros around the border.
 
-use super::{Grads, Layer, Pair, Pass};
+use serde::{Deserialize, Serialize};
+use steersman_kernels::Backend;
+
+use super::kind::MAX_NUMBERS;
+use super::{ExportForm, Family, Grads, Layer, LayerKind, Pair, Pass, ReceptiveField};
 use crate::engine::tensor::Shape;
 
 /// Adds rows and columns of zeros (Keras' `ZeroPadding2D`).
 ///
-/// **Forward** copies the input into the middle; the border is 0. **Backward** `dx` is the middle of `dy`.
-/// Training and evaluation are the same.
+/// - **Forward** `y[c][i + top][j + left] = x[c][i][j]`, and `y = 0` around it.
+/// - **Backward** of `y[c][i + top][j + left] = x[c][i][j]`: `dx[c][i][j] = dy[c][i + top][j + left]`. Needs nothing.
+/// - **Training and evaluation** are the same.
+/// - **Limits** The output has at most 2²⁶ values an image.
+///
+/// # Shapes
+///
+/// x, dx: `[n][c][h][w]`; y, dy: `[n][c][h + top + bottom][w + left + right]`.
 #[derive(Debug)]
 pub struct ZeroPad {
     input: Shape,
@@ -59,6 +69,54 @@ impl Layer for ZeroPad {
         for (from, to) in self.rows(n) {
             dx[from..from + width].copy_from_slice(&pair.dy[to..to + width]);
         }
+    }
+}
+
+/// Options of [`ZeroPad`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ZeroPadSpec {
+    /// Rows added at the top and at the bottom.
+    #[serde(default)]
+    pub rows: [usize; 2],
+    /// Columns added on the left and on the right.
+    #[serde(default)]
+    pub columns: [usize; 2],
+}
+
+impl LayerKind for ZeroPadSpec {
+    fn base_name(&self) -> &'static str {
+        "pad"
+    }
+
+    fn describe(&self) -> String {
+        "zero padding".into()
+    }
+
+    fn family(&self) -> Family {
+        Family::Rearrangement
+    }
+
+    fn receptive_field(&self, _input: Shape) -> ReceptiveField {
+        let before = [self.rows[0] as isize, self.columns[0] as isize];
+        ReceptiveField::Window { size: [1, 1], stride: [1, 1], before }
+    }
+
+    fn check(&self, input: Shape) -> Result<(), String> {
+        let sum = |inside: usize, border: [usize; 2]| border.iter().fold(inside, |a, b| a.saturating_add(*b));
+        let outputs = sum(input.h, self.rows).saturating_mul(sum(input.w, self.columns)).saturating_mul(input.c);
+        match outputs > MAX_NUMBERS {
+            true => Err(format!("the padded map would have more than {MAX_NUMBERS} numbers")),
+            false => Ok(()),
+        }
+    }
+
+    fn layer(&self, input: Shape, _backend: Backend) -> Result<Box<dyn Layer>, String> {
+        Ok(Box::new(ZeroPad::new(input, self.rows, self.columns)))
+    }
+
+    fn export_form(&self, _input: Shape, _params: &[f32], _statistics: &[f32]) -> ExportForm {
+        ExportForm::ZeroPad { top: self.rows[0], left: self.columns[0] }
     }
 }
 

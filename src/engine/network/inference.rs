@@ -6,8 +6,8 @@ use ndarray::{Array2, ArrayView4};
 use rayon::prelude::*;
 
 use super::stages::{Kind, Stage, stages};
-use super::{LayerSpec, Network, Parameters};
-use crate::engine::layers::Prepared;
+use super::{Network, Parameters};
+use crate::engine::layers::{Family, Packing};
 use crate::engine::stopwatch::Stopwatch;
 use crate::engine::tensor::Shape;
 use crate::error::{Error, Result};
@@ -50,7 +50,7 @@ impl InferencePlan {
     pub fn new(network: &Network, capacity: usize) -> InferencePlan {
         let group = capacity.clamp(1, GROUP);
         let stages = stages(network);
-        let is_dense = |stage: &Stage| matches!(network.layers()[stage.layers.start].spec, LayerSpec::Dense { .. });
+        let is_dense = |stage: &Stage| network.layers()[stage.layers.start].spec.family() == Family::Dense;
         let maps = stages.iter().position(is_dense).unwrap_or(stages.len());
         let largest = |stages: &[Stage]| stages.iter().map(|stage| stage.output_len(network)).max().unwrap_or(0);
         let between = stages[..maps].last().map_or(0, |stage| stage.output_len(network));
@@ -62,7 +62,7 @@ impl InferencePlan {
             group: [vec![0.0; after], vec![0.0; after]],
             scratch: vec![0.0; scratch],
         };
-        let prepared_len = |stage: &Stage| stage.prepared(network).map_or(0, |prepared| prepared.prepared_len());
+        let prepared_len = |stage: &Stage| stage.packing(network).map_or(0, |packing| packing.packed_len());
         InferencePlan {
             prepared: stages.iter().map(|stage| vec![0.0; prepared_len(stage)]).collect(),
             is_prepared: false,
@@ -94,8 +94,8 @@ impl InferencePlan {
     /// [`run_prepared`](InferencePlan::run_prepared) with few images each.
     pub fn prepare(&mut self, network: &Network, parameters: &Parameters) {
         for (stage, to) in self.stages.iter().zip(&mut self.prepared) {
-            if let Some(prepared) = stage.prepared(network) {
-                prepared.prepare(&parameters.values[stage.params(network)], to);
+            if let Some(packing) = stage.packing(network) {
+                packing.pack(&parameters.values[stage.params(network)], to);
             }
         }
         self.is_prepared = true;
@@ -181,12 +181,12 @@ impl Run<'_> {
         let params = &self.parameters.values[stage.params(self.network)];
         let statistics = &self.parameters.statistics[first.statistics.clone()];
         match &stage.kind {
-            Kind::Layer => match first.layer.prepared() {
-                Some(layer) => layer.infer_prepared(&self.prepared[index], n, x, y, scratch),
+            Kind::Layer => match first.layer.packing() {
+                Some(layer) => layer.infer_packed(&self.prepared[index], n, x, y, scratch),
                 None => first.layer.infer(params, statistics, n, x, y, scratch),
             },
             Kind::NormRectify(fused) => fused.infer(params, statistics, n, x, y, scratch),
-            Kind::PooledConv(fused) => fused.infer_prepared(&self.prepared[index], n, x, y, scratch),
+            Kind::PooledConv(fused) => fused.infer_packed(&self.prepared[index], n, x, y, scratch),
         }
     }
 }
@@ -219,7 +219,7 @@ impl Network {
 mod tests {
     use steersman_kernels::Isa;
 
-    use super::super::NamedLayer;
+    use super::super::{LayerSpec, NamedLayer};
     use super::*;
 
     #[derive(serde::Deserialize)]

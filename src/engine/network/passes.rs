@@ -34,7 +34,7 @@ impl<'a> Run<'a> {
             layer,
             first_image,
             moments,
-            prepared: &self.prepared[stage],
+            packed: &self.prepared[stage],
         }
     }
 

@@ -10,7 +10,10 @@
 use std::ops::Range;
 
 use super::{LayerSpec, NamedLayer, Network};
-use crate::engine::layers::{BatchNorm, BatchStatistics, Conv2d, NormRectify, PooledConv, Prepared, Rising, Slopes};
+use crate::engine::layers::{
+    BatchNorm, BatchNormSpec, BatchStatistics, Conv2d, Conv2dSpec, EluSpec, MaxPoolSpec, NormRectify, PReluSpec,
+    Packing, PooledConv, Rising, Slopes,
+};
 
 /// Neighbouring layers that run as one.
 #[derive(Clone, Debug)]
@@ -73,10 +76,10 @@ impl Stage {
         }
     }
 
-    /// Its passes with prepared parameters, if it has those.
-    pub fn prepared<'a>(&'a self, network: &'a Network) -> Option<&'a dyn Prepared> {
+    /// How its weights are packed, if they are.
+    pub fn packing<'a>(&'a self, network: &'a Network) -> Option<&'a dyn Packing> {
         match &self.kind {
-            Kind::Layer => network.layers()[self.layers.start].layer.prepared(),
+            Kind::Layer => network.layers()[self.layers.start].layer.packing(),
             Kind::NormRectify(_) => None,
             Kind::PooledConv(fused) => Some(&**fused),
         }
@@ -136,18 +139,20 @@ pub(super) fn replaces_input(network: &Network, stages: &[Stage], index: usize) 
 
 /// The layers at the start of `layers` that a [`NormRectify`] stands for, and how many they are.
 fn norm_rectify(network: &Network, layers: &[NamedLayer]) -> Option<(usize, NormRectify)> {
-    let LayerSpec::BatchNorm { epsilon, running_old_weight } = layers.first()?.spec else { return None };
+    let LayerSpec::BatchNorm(BatchNormSpec { epsilon, running_old_weight }) = layers.first()?.spec else { return None };
     // It takes the gradients of its slopes at the barrier, which frozen batch norm has not.
     if layers[0].frozen {
         return None;
     }
     let slopes = match layers.get(1)?.spec {
-        LayerSpec::Relu {} => None,
-        LayerSpec::PRelu { slopes, .. } => Some(slopes),
+        LayerSpec::Relu(_) => None,
+        LayerSpec::PRelu(PReluSpec { slopes, .. }) => Some(slopes),
         _ => return None,
     };
     let pooled = match layers.get(2).map(|layer| &layer.spec) {
-        Some(LayerSpec::MaxPool { window: [2, 2], stride }) => stride.is_none_or(|stride| stride == [2, 2]),
+        Some(LayerSpec::MaxPool(MaxPoolSpec { window: [2, 2], stride })) => {
+            stride.is_none_or(|stride| stride == [2, 2])
+        }
         _ => false,
     };
     let shape = layers[0].layer.input();
@@ -160,13 +165,15 @@ fn norm_rectify(network: &Network, layers: &[NamedLayer]) -> Option<(usize, Norm
 /// What stands for the first three of `layers`, if a [`PooledConv`] does.
 fn pooled_conv(network: &Network, layers: &[NamedLayer]) -> Option<PooledConv> {
     let [conv, activation, pool, ..] = layers else { return None };
-    let LayerSpec::Conv2d { filters, kernel, stride, padding, init } = conv.spec else { return None };
+    let LayerSpec::Conv2d(Conv2dSpec { filters, kernel, stride, padding, init }) = conv.spec else { return None };
     let activation = match activation.spec {
-        LayerSpec::Relu {} => Rising::Relu,
-        LayerSpec::Elu { alpha } => Rising::Elu(alpha),
+        LayerSpec::Relu(_) => Rising::Relu,
+        LayerSpec::Elu(EluSpec { alpha }) => Rising::Elu(alpha),
         _ => return None,
     };
-    let LayerSpec::MaxPool { window: [4, 4], stride: None | Some([4, 4]) } = pool.spec else { return None };
+    let LayerSpec::MaxPool(MaxPoolSpec { window: [4, 4], stride: None | Some([4, 4]) }) = pool.spec else {
+        return None;
+    };
     let isa = network.isa();
     let conv = Conv2d::new(conv.layer.input(), filters, kernel, stride, padding, init, network.backend()).ok()?;
     PooledConv::new(conv, activation, isa)

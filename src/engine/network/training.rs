@@ -165,7 +165,7 @@ impl TrainingPlan {
             times: StepTimes::off(stages.len()),
             prepared: stages
                 .iter()
-                .map(|stage| stage.prepared(network).map_or(0, |prepared| prepared.prepared_for_training_len()))
+                .map(|stage| stage.packing(network).map_or(0, |packing| packing.training_packed_len()))
                 .map(|len| vec![0.0; len])
                 .collect(),
             stages,
@@ -237,8 +237,8 @@ impl TrainingPlan {
     /// Puts the parameters in the order in which the passes read them, once for all shards.
     fn prepare(&mut self, network: &Network, parameters: &Parameters) {
         self.prepared.par_iter_mut().zip(&self.stages).for_each(|(to, stage)| {
-            if let Some(prepared) = stage.prepared(network) {
-                prepared.prepare_for_training(&parameters.values[stage.params(network)], to);
+            if let Some(packing) = stage.packing(network) {
+                packing.pack_for_training(&parameters.values[stage.params(network)], to);
             }
         });
     }

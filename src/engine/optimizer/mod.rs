@@ -244,13 +244,14 @@ impl Optimizer {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::engine::layers::DenseSpec;
     use crate::engine::network::LayerSpec;
     use crate::engine::tensor::{Initializer, Shape};
     use steersman_kernels::Isa;
 
     /// Two dense layers: 5 x 1000 weights and 1000 biases, then 1000 weights and 1 bias; more than one chunk.
     fn network() -> Network {
-        let dense = |units| LayerSpec::Dense { units, init: Initializer::GlorotUniform };
+        let dense = |units| LayerSpec::Dense(DenseSpec { units, init: Initializer::GlorotUniform });
         Network::new(Shape::vector(5), &[dense(1000), dense(1)], Isa::best()).unwrap()
     }
 

@@ -10,7 +10,10 @@ use super::file::Tensor;
 use super::limits::check_size;
 use super::messages::{Problem, shown};
 use super::translate::{AxisOrder, KernelLayout, Operation, Step};
-use crate::engine::layers::Slopes;
+use crate::engine::layers::{
+    AveragePoolSpec, BatchNormSpec, Conv2dSpec, DenseSpec, FlattenSpec, MaxPoolSpec, PReluSpec, Padding,
+    ReceptiveField, Slopes,
+};
 use crate::engine::network::{LayerSpec, Parameters};
 use crate::engine::tensor::{Initializer, Shape};
 
@@ -83,7 +86,7 @@ impl Assembler<'_> {
         match &step.operation {
             Operation::Nothing | Operation::Input => {}
             Operation::Plain(spec) => {
-                if matches!(spec, LayerSpec::ZeroPad { .. } | LayerSpec::Crop { .. }) {
+                if matches!(spec.receptive_field(self.shape), ReceptiveField::Window { .. }) {
                     self.needs_map()?;
                 }
                 self.push(spec.clone(), Vec::new(), Vec::new())?;
@@ -127,11 +130,9 @@ impl Assembler<'_> {
         if self.is_flat { Err("needs a map, but comes behind a flattened one".into()) } else { Ok(()) }
     }
 
-    fn conv(&mut self, spec: &LayerSpec, layout: KernelLayout, bias: bool, tensors: &[Tensor]) -> Result<(), String> {
+    fn conv(&mut self, spec: &Conv2dSpec, layout: KernelLayout, bias: bool, tensors: &[Tensor]) -> Result<(), String> {
         self.needs_map()?;
-        let LayerSpec::Conv2d { filters: oc, kernel: [kh, kw], .. } = *spec else {
-            unreachable!("a convolution is translated into one");
-        };
+        let Conv2dSpec { filters: oc, kernel: [kh, kw], .. } = *spec;
         let ic = self.shape.c;
         let kernel_shape = match layout {
             KernelLayout::HeightWidthInOut => [kh, kw, ic, oc],
@@ -155,7 +156,7 @@ impl Assembler<'_> {
             }
         }
         values.extend(bias.unwrap_or_else(|| vec![0.0; oc]));
-        self.push(spec.clone(), values, Vec::new())
+        self.push(spec.clone().into(), values, Vec::new())
     }
 
     fn dense(&mut self, units: usize, bias: bool, tensors: &[Tensor]) -> Result<(), String> {
@@ -165,11 +166,12 @@ impl Assembler<'_> {
         if on_map && self.context.order == AxisOrder::ChannelsFirst {
             return Err("works on the columns of a map, which has no counterpart".into());
         }
-        let spec = match on_map {
+        let spec: LayerSpec = match on_map {
             true => {
-                LayerSpec::Conv2d { filters: units, kernel: [1, 1], stride: [1, 1], padding: Default::default(), init }
+                let padding = Padding::default();
+                Conv2dSpec { filters: units, kernel: [1, 1], stride: [1, 1], padding, init }.into()
             }
-            false => LayerSpec::Dense { units, init },
+            false => DenseSpec { units, init }.into(),
         };
         spec.build(self.shape, Isa::PORTABLE)?;
         let inputs = if on_map { self.shape.c } else { self.shape.len() };
@@ -186,7 +188,7 @@ impl Assembler<'_> {
 
     fn batch_norm(
         &mut self,
-        spec: &LayerSpec,
+        spec: &BatchNormSpec,
         axis: i64,
         [scale, center]: [bool; 2],
         tensors: &[Tensor],
@@ -196,10 +198,6 @@ impl Assembler<'_> {
         if axis != channels && axis != channels - axes {
             return Err(format!("normalises axis {axis}, which is not that of the channels"));
         }
-        let epsilon = match spec {
-            LayerSpec::BatchNorm { epsilon, .. } => *epsilon,
-            _ => unreachable!("batch normalisation is translated into itself"),
-        };
         let c: &[usize] = &[self.shape.c];
         let read = expect(tensors, &[scale.then_some(c), center.then_some(c), Some(c), Some(c)])?;
         let permute = |values: Vec<f32>| match self.interleaved {
@@ -209,10 +207,10 @@ impl Assembler<'_> {
         let mut read = read.into_iter().map(|values| values.map(permute));
         let mut next = |default: f32| read.next().flatten().unwrap_or_else(|| vec![default; c[0]]);
         let (gamma, beta, mean, variance) = (next(1.0), next(0.0), next(0.0), next(1.0));
-        if variance.iter().any(|variance| variance + epsilon <= 0.0) {
+        if variance.iter().any(|variance| variance + spec.epsilon <= 0.0) {
             return Err("a running variance is negative".into());
         }
-        self.push(spec.clone(), [gamma, beta].concat(), [mean, variance].concat())
+        self.push(spec.clone().into(), [gamma, beta].concat(), [mean, variance].concat())
     }
 
     fn prelu(&mut self, tensors: &[Tensor]) -> Result<(), String> {
@@ -243,8 +241,8 @@ impl Assembler<'_> {
         }
         if shared_by_positions {
             let values = if slopes.len() == c { slopes } else { vec![slopes[0]; c] };
-            let spec = LayerSpec::PRelu { slopes: Slopes::PerChannel, initial_slope: 0.0 };
-            return self.push(spec, values, Vec::new());
+            let spec = PReluSpec { slopes: Slopes::PerChannel, initial_slope: 0.0 };
+            return self.push(spec.into(), values, Vec::new());
         }
         let values = match self.interleaved {
             Some(map) if slopes.len() == c => interleaved_places(map).into_iter().map(|place| slopes[place]).collect(),
@@ -254,7 +252,7 @@ impl Assembler<'_> {
                 (0..count).map(|i| slopes[place(i)]).collect()
             }
         };
-        self.push(LayerSpec::PRelu { slopes: Slopes::PerPosition, initial_slope: 0.0 }, values, Vec::new())
+        self.push(PReluSpec { slopes: Slopes::PerPosition, initial_slope: 0.0 }.into(), values, Vec::new())
     }
 
     /// `found`, extents in the order of the file, as those of channels, rows and columns.
@@ -286,7 +284,7 @@ impl Assembler<'_> {
             return Err(format!("pads the border of its {h}x{w} input, which has no counterpart in pooling"));
         }
         let stride = (stride != window).then_some(stride);
-        let spec = if max { LayerSpec::MaxPool { window, stride } } else { LayerSpec::AveragePool { window, stride } };
+        let spec = if max { MaxPoolSpec { window, stride }.into() } else { AveragePoolSpec { window, stride }.into() };
         self.push(spec, Vec::new(), Vec::new())
     }
 
@@ -303,7 +301,7 @@ impl Assembler<'_> {
         };
         self.interleaved = Some(self.shape).filter(|map| interleaves && map.positions() > 1);
         self.is_flat = true;
-        self.push(LayerSpec::Flatten {}, Vec::new(), Vec::new())
+        self.push(FlattenSpec {}.into(), Vec::new(), Vec::new())
     }
 }
 

@@ -5,7 +5,10 @@ use serde_json::{Map, Value};
 use super::architecture::KerasLayer;
 use super::lambda::{self, Affine};
 use super::messages::shown;
-use crate::engine::layers::Padding;
+use crate::engine::layers::{
+    BatchNormSpec, Conv2dSpec, CropSpec, DropoutSpec, EluSpec, LeakyReluSpec, Padding, ReluSpec, ScaleSpec,
+    SoftsignSpec, SwishSpec, TanhSpec, ZeroPadSpec,
+};
 use crate::engine::network::LayerSpec;
 use crate::engine::tensor::Initializer;
 
@@ -37,7 +40,7 @@ pub(super) enum Operation {
     /// A layer without weights that is the same for every shape.
     Plain(LayerSpec),
     Conv {
-        spec: LayerSpec,
+        spec: Conv2dSpec,
         kernel: KernelLayout,
         bias: bool,
     },
@@ -46,7 +49,7 @@ pub(super) enum Operation {
         bias: bool,
     },
     BatchNorm {
-        spec: LayerSpec,
+        spec: BatchNormSpec,
         axis: i64,
         center: bool,
         scale: bool,
@@ -106,11 +109,11 @@ pub(super) fn translate(layer: &KerasLayer, known: Option<Affine>) -> Result<Ste
                     format!("{reason}; if it is x / A - B, say so with --lambda {}=A,B", layer.name)
                 })?,
             };
-            Operation::Plain(LayerSpec::Scale { factor: factor as f32, offset: offset as f32 })
+            Operation::Plain(ScaleSpec { factor: factor as f32, offset: offset as f32 }.into())
         }
         "Rescaling" => {
             let (factor, offset) = (options.number(&["scale"], 1.0)?, options.number(&["offset"], 0.0)?);
-            Operation::Plain(LayerSpec::Scale { factor: factor as f32, offset: offset as f32 })
+            Operation::Plain(ScaleSpec { factor: factor as f32, offset: offset as f32 }.into())
         }
         "Conv2D" | "Convolution2D" => {
             activation = options.activation()?;
@@ -129,7 +132,7 @@ pub(super) fn translate(layer: &KerasLayer, known: Option<Affine>) -> Result<Ste
             }
             let old_weight = options.number(&["momentum"], 0.99)?;
             Operation::BatchNorm {
-                spec: LayerSpec::BatchNorm {
+                spec: BatchNormSpec {
                     epsilon: options.number(&["epsilon"], 1e-3)? as f32,
                     running_old_weight: old_weight as f32,
                 },
@@ -149,18 +152,18 @@ pub(super) fn translate(layer: &KerasLayer, known: Option<Affine>) -> Result<Ste
         }
         "ZeroPadding2D" => {
             let [rows, columns] = options.border(&["padding"])?;
-            Operation::Plain(LayerSpec::ZeroPad { rows, columns })
+            Operation::Plain(ZeroPadSpec { rows, columns }.into())
         }
         "Cropping2D" => {
             let [rows, columns] = options.border(&["cropping"])?;
-            Operation::Plain(LayerSpec::Crop { rows, columns })
+            Operation::Plain(CropSpec { rows, columns }.into())
         }
         "Flatten" => Operation::Flatten,
         "Dropout" | "SpatialDropout2D" => {
             if layer.class != "Dropout" {
                 notice = Some("drops whole channels in training; here it drops single numbers");
             }
-            Operation::Plain(LayerSpec::Dropout { drop_probability: options.number(&["rate", "p"], 0.0)? as f32 })
+            Operation::Plain(DropoutSpec { drop_probability: options.number(&["rate", "p"], 0.0)? as f32 }.into())
         }
         "GaussianNoise" | "GaussianDropout" | "AlphaDropout" | "ActivityRegularization" => {
             notice = Some("acts in training only, and is left out");
@@ -200,8 +203,8 @@ fn without_counterpart(class: &str) -> &'static str {
 /// An activation that is a layer of its own, or is named by one.
 fn pointwise(class: &str, options: &Options) -> Result<Option<LayerSpec>, String> {
     Ok(Some(match class {
-        "ELU" => LayerSpec::Elu { alpha: options.number(&["alpha"], 1.0)? as f32 },
-        "LeakyReLU" => LayerSpec::LeakyRelu { slope: options.number(&["negative_slope", "alpha"], 0.3)? as f32 },
+        "ELU" => EluSpec { alpha: options.number(&["alpha"], 1.0)? as f32 }.into(),
+        "LeakyReLU" => LeakyReluSpec { slope: options.number(&["negative_slope", "alpha"], 0.3)? as f32 }.into(),
         "ReLU" => {
             if options.0.get("max_value").is_some_and(|value| !value.is_null()) {
                 return Err("a rectifier with a ceiling has no counterpart".into());
@@ -210,8 +213,8 @@ fn pointwise(class: &str, options: &Options) -> Result<Option<LayerSpec>, String
                 return Err("a rectifier with a threshold has no counterpart".into());
             }
             match options.number(&["negative_slope"], 0.0)? {
-                0.0 => LayerSpec::Relu {},
-                slope => LayerSpec::LeakyRelu { slope: slope as f32 },
+                0.0 => ReluSpec {}.into(),
+                slope => LeakyReluSpec { slope: slope as f32 }.into(),
             }
         }
         _ => return Ok(None),
@@ -234,7 +237,7 @@ fn conv(options: &Options) -> Result<Operation, String> {
     let filters = options.size(&["filters", "nb_filter"])?;
     let theano = options.0.get("dim_ordering").and_then(Value::as_str) == Some("th");
     Ok(Operation::Conv {
-        spec: LayerSpec::Conv2d { filters, kernel, stride, padding, init: Initializer::default() },
+        spec: Conv2dSpec { filters, kernel, stride, padding, init: Initializer::default() },
         kernel: if theano { KernelLayout::OutInHeightWidth } else { KernelLayout::HeightWidthInOut },
         bias: options.flag(&["use_bias", "bias"], true)?,
     })
@@ -361,11 +364,12 @@ fn activation(value: &Value) -> Result<Option<LayerSpec>, String> {
     };
     Ok(Some(match name {
         "linear" => return Ok(None),
-        "relu" => LayerSpec::Relu {},
-        "elu" => LayerSpec::Elu { alpha: 1.0 },
-        "tanh" => LayerSpec::Tanh {},
-        "softsign" => LayerSpec::Softsign {},
-        "leaky_relu" => LayerSpec::LeakyRelu { slope: 0.2 },
+        "relu" => ReluSpec {}.into(),
+        "elu" => EluSpec { alpha: 1.0 }.into(),
+        "tanh" => TanhSpec {}.into(),
+        "softsign" => SoftsignSpec {}.into(),
+        "swish" | "silu" => SwishSpec {}.into(),
+        "leaky_relu" => LeakyReluSpec { slope: 0.2 }.into(),
         _ => return Err(format!("activation `{}` has no counterpart", shown(name))),
     }))
 }
@@ -421,11 +425,11 @@ mod tests {
 
     #[test]
     fn borders_are_read_in_every_spelling() {
-        let expected = Operation::Plain(LayerSpec::ZeroPad { rows: [1, 1], columns: [2, 2] });
+        let expected = Operation::Plain(ZeroPadSpec { rows: [1, 1], columns: [2, 2] }.into());
         for padding in [json!([1, 2]), json!([1, 1, 2, 2]), json!([[1, 1], [2, 2]])] {
             assert_eq!(step("ZeroPadding2D", json!({"padding": padding})).operation, expected);
         }
-        let expected = Operation::Plain(LayerSpec::Crop { rows: [50, 20], columns: [0, 1] });
+        let expected = Operation::Plain(CropSpec { rows: [50, 20], columns: [0, 1] }.into());
         assert_eq!(step("Cropping2D", json!({"cropping": [[50, 20], [0, 1]]})).operation, expected);
         assert!(reason("Cropping2D", json!({"cropping": [[50, -20], [0, 1]]})).contains("whole numbers"));
         assert!(reason("Cropping2D", json!({"cropping": [50, 20, 7]})).contains("whole numbers"));
@@ -461,6 +465,6 @@ mod tests {
     fn the_user_can_say_what_a_lambda_computes() {
         let known = Some(Affine { factor: 0.5, offset: -1.0 });
         let step = translate(&layer("Lambda", json!({"function": "normalise"})), known).unwrap();
-        assert_eq!(step.operation, Operation::Plain(LayerSpec::Scale { factor: 0.5, offset: -1.0 }));
+        assert_eq!(step.operation, Operation::Plain(ScaleSpec { factor: 0.5, offset: -1.0 }.into()));
     }
 }

@@ -15,7 +15,8 @@ use steersman_kernels::Isa;
 
 use self::graph::{GraphBuilder, float, int, ints};
 use self::proto::{DataType, ModelProto, OperatorSetIdProto, StringStringEntryProto};
-use super::chain::{Op, Step, chain, check_finite, fold_batch_norm};
+use super::chain::{Step, chain, check_finite, fold_batch_norm};
+use crate::engine::layers::{ExportForm, Formula, Function};
 use crate::error::{Error, Result};
 use crate::model_file::{LABEL, Model};
 
@@ -88,11 +89,7 @@ pub fn onnx(model: &Model, options: OnnxOptions) -> Result<Vec<u8>> {
 fn check_size(steps: &[Step]) -> Result<()> {
     let mut bytes = 0;
     for step in steps {
-        bytes += 4 * match &step.op {
-            Op::Conv { weight, .. } | Op::Dense { weight, .. } => weight.len(),
-            Op::PRelu { slopes } => slopes.len(),
-            _ => 0,
-        };
+        bytes += 4 * step.weight_len();
         if bytes > MAX_WEIGHT_BYTES {
             let message = "with its weights the file would pass the 2 GiB that an ONNX file can have".into();
             return Err(Error::Network { layer: step.name.clone(), message });
@@ -107,12 +104,17 @@ fn network(graph: &mut GraphBuilder, steps: &[Step], input: &str, output: &str) 
     // A vector is [N, c] in ONNX, and [N, c, 1, 1] for the layers of maps.
     let mut is_map = true;
     for step in steps {
-        let takes = match step.op {
-            Op::Conv { .. } | Op::MaxPool { .. } | Op::AveragePool { .. } | Op::Crop { .. } | Op::ZeroPad { .. } => {
-                Some(true)
-            }
-            Op::Dense { .. } | Op::Flatten => Some(false),
-            _ => None,
+        let takes = match step.form {
+            ExportForm::Conv { .. }
+            | ExportForm::MaxPool { .. }
+            | ExportForm::AveragePool { .. }
+            | ExportForm::Crop { .. }
+            | ExportForm::ZeroPad { .. } => Some(true),
+            ExportForm::Dense { .. } | ExportForm::Flatten => Some(false),
+            ExportForm::Identity
+            | ExportForm::Elementwise(_)
+            | ExportForm::BatchNorm { .. }
+            | ExportForm::PRelu { .. } => None,
         };
         match takes {
             Some(true) if !is_map => {
@@ -136,40 +138,30 @@ fn network(graph: &mut GraphBuilder, steps: &[Step], input: &str, output: &str) 
 
 /// Adds the nodes of one step; the name of its result.
 fn operation(graph: &mut GraphBuilder, step: &Step, x: &str, is_map: bool) -> String {
-    let Step { name, input, output, op } = step;
+    let Step { name, input, output, form } = step;
     let constant = |what: &str| format!("{name}.{what}");
-    match op {
-        Op::Conv { kernel, stride, pads, weight, bias } => {
+    match form {
+        ExportForm::Conv { kernel, stride, pads, weight, bias } => {
             let weight = graph.floats(&constant("weight"), &[output.c, input.c, kernel[0], kernel[1]], weight);
             let bias = graph.floats(&constant("bias"), &[output.c], bias);
             let pads = ints("pads", &[pads.top, pads.left, pads.bottom, pads.right]);
             let attributes = vec![ints("kernel_shape", kernel), ints("strides", stride), pads];
             graph.node("Conv", name, &[x, &weight, &bias], attributes)
         }
-        Op::Dense { weight, bias } => {
+        ExportForm::Dense { weight, bias } => {
             let weight = graph.floats(&constant("weight"), &[output.len(), input.len()], weight);
             let bias = graph.floats(&constant("bias"), &[output.len()], bias);
             graph.node("Gemm", name, &[x, &weight, &bias], vec![int("transB", 1)])
         }
-        Op::BatchNorm { gamma, beta, mean, variance, epsilon } => {
+        ExportForm::BatchNorm { gamma, beta, mean, variance, epsilon } => {
             let mut tensor = |what: &str, values: &[f32]| graph.floats(&constant(what), &[input.c], values);
             let (gamma, beta) = (tensor("gamma", gamma), tensor("beta", beta));
             let (mean, variance) = (tensor("running_mean", mean), tensor("running_variance", variance));
             let inputs = [x, &gamma, &beta, &mean, &variance];
             graph.node("BatchNormalization", name, &inputs, vec![float("epsilon", *epsilon)])
         }
-        Op::Scale { factor, offset } => {
-            let factor = graph.floats(&constant("factor"), &[], &[*factor]);
-            let offset = graph.floats(&constant("offset"), &[], &[*offset]);
-            let scaled = graph.node("Mul", &constant("scaled"), &[x, &factor], vec![]);
-            graph.node("Add", name, &[&scaled, &offset], vec![])
-        }
-        Op::Relu => graph.node("Relu", name, &[x], vec![]),
-        Op::Elu { alpha } => graph.node("Elu", name, &[x], vec![float("alpha", *alpha)]),
-        Op::LeakyRelu { slope } => graph.node("LeakyRelu", name, &[x], vec![float("alpha", *slope)]),
-        Op::Tanh => graph.node("Tanh", name, &[x], vec![]),
-        Op::Softsign => graph.node("Softsign", name, &[x], vec![]),
-        Op::PRelu { slopes } => {
+        ExportForm::Elementwise(formula) => elementwise(graph, name, name, formula, x, &mut 0),
+        ExportForm::PRelu { slopes } => {
             // The slopes are broadcast from the right.
             let dims: &[usize] = match (is_map, slopes.len() == input.len()) {
                 (false, _) => &[input.c],
@@ -179,24 +171,65 @@ fn operation(graph: &mut GraphBuilder, step: &Step, x: &str, is_map: bool) -> St
             let slopes = graph.floats(&constant("slope"), dims, slopes);
             graph.node("PRelu", name, &[x, &slopes], vec![])
         }
-        Op::MaxPool { window, stride } => {
+        ExportForm::MaxPool { window, stride } => {
             graph.node("MaxPool", name, &[x], vec![ints("kernel_shape", window), ints("strides", stride)])
         }
-        Op::AveragePool { window, stride } => {
+        ExportForm::AveragePool { window, stride } => {
             graph.node("AveragePool", name, &[x], vec![ints("kernel_shape", window), ints("strides", stride)])
         }
-        Op::Crop { top, left } => {
+        ExportForm::Crop { top, left } => {
             let starts = graph.int64s(&constant("starts"), &[*top, *left]);
             let ends = graph.int64s(&constant("ends"), &[top + output.h, left + output.w]);
             let axes = graph.int64s(&constant("axes"), &[2, 3]);
             graph.node("Slice", name, &[x, &starts, &ends, &axes], vec![])
         }
-        Op::ZeroPad { top, left } => {
+        ExportForm::ZeroPad { top, left } => {
             let (bottom, right) = (output.h - input.h - top, output.w - input.w - left);
             let pads = graph.int64s(&constant("pads"), &[0, 0, *top, *left, 0, 0, bottom, right]);
             graph.node("Pad", name, &[x, &pads], vec![])
         }
-        Op::Flatten => x.into(),
+        ExportForm::Flatten | ExportForm::Identity => x.into(),
+    }
+}
+
+/// Adds the nodes of `formula` at `x`, the last of which is called `result`; the name of its result. Nodes and constants on the
+/// way are numbered behind the name of the layer.
+fn elementwise(
+    graph: &mut GraphBuilder,
+    layer: &str,
+    result: &str,
+    formula: &Formula,
+    x: &str,
+    count: &mut usize,
+) -> String {
+    let mut part = |graph: &mut GraphBuilder, formula: &Formula| {
+        *count += 1;
+        let name = format!("{layer}.part{count}");
+        elementwise(graph, layer, &name, formula, x, count)
+    };
+    match formula {
+        Formula::X => x.into(),
+        Formula::Number(number) => graph.floats(result, &[], &[*number]),
+        Formula::Sum(terms) => {
+            let terms = terms.each_ref().map(|term| part(graph, term));
+            graph.node("Add", result, &terms.each_ref().map(String::as_str), vec![])
+        }
+        Formula::Product(factors) => {
+            let factors = factors.each_ref().map(|factor| part(graph, factor));
+            graph.node("Mul", result, &factors.each_ref().map(String::as_str), vec![])
+        }
+        Formula::Apply(function, argument) => {
+            let (op, attributes) = match *function {
+                Function::Relu => ("Relu", vec![]),
+                Function::Elu { alpha } => ("Elu", vec![float("alpha", alpha)]),
+                Function::LeakyRelu { slope } => ("LeakyRelu", vec![float("alpha", slope)]),
+                Function::Tanh => ("Tanh", vec![]),
+                Function::Softsign => ("Softsign", vec![]),
+                Function::Sigmoid => ("Sigmoid", vec![]),
+            };
+            let argument = part(graph, argument);
+            graph.node(op, result, &[&argument], attributes)
+        }
     }
 }
 

@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use super::program::{Arg, Array, Buffer, Call, Program, Values, pick_sections, statement, wrap};
+use super::program::{Arg, Array, Buffer, Program, Statement, Values, expression, pick_sections, statement, wrap};
 
 const LIBRARY: &str = include_str!("library.c");
 
@@ -50,12 +50,22 @@ fn write_to(text: &mut String, program: &Program) -> std::fmt::Result {
         writeln!(text, "static {kind} {}[{len}];", buffer.name())?;
     }
     writeln!(text, "\nfloat steer(const uint8_t image[STEER_HEIGHT * STEER_WIDTH * 3]) {{")?;
-    for Call { comment, function, args } in &program.calls {
-        if let Some(comment) = comment {
-            writeln!(text, "    /* {comment} */")?;
+    for step in &program.statements {
+        match step {
+            Statement::Call { comment, function, args } => {
+                if let Some(comment) = comment {
+                    writeln!(text, "    /* {comment} */")?;
+                }
+                let args: Vec<String> = args.iter().map(argument).collect();
+                writeln!(text, "{}", statement(function, &args, "    "))?;
+            }
+            Statement::Map { comment, buffer, len, formula } => {
+                let x = format!("{}[i]", buffer.name());
+                let value = expression(formula, &x, number);
+                writeln!(text, "    /* {comment} */\n    for (int i = 0; i < {len}; i++) {{")?;
+                writeln!(text, "        {x} = {value};\n    }}")?;
+            }
         }
-        let args: Vec<String> = args.iter().map(argument).collect();
-        writeln!(text, "{}", statement(function, &args, "    "))?;
     }
     writeln!(text, "    return {}[0];\n}}", program.result.name())
 }
@@ -67,6 +77,10 @@ fn write_array(text: &mut String, Array { name, values }: &Array) -> std::fmt::R
         Values::U16(values) => ("uint16_t", values.len(), wrap(values.iter().map(u16::to_string))),
     };
     writeln!(text, "static const {kind} {name}[{len}] = {{\n{numbers}\n}};\n")
+}
+
+fn number(value: f32) -> String {
+    format!("{value:?}f")
 }
 
 fn argument(arg: &Arg) -> String {
@@ -81,7 +95,7 @@ fn argument(arg: &Arg) -> String {
         Arg::Change(buffer, len) => format!("{}, {len}", buffer.name()),
         Arg::Array(name) => name.clone(),
         Arg::Int(value) => value.to_string(),
-        Arg::Float(value) => format!("{value:?}f"),
+        Arg::Float(value) => number(*value),
         Arg::Sizes(name, fields) => {
             let fields: Vec<_> = fields.iter().map(|(field, value)| format!(".{field} = {value}")).collect();
             format!("(struct {name}){{{}}}", fields.join(", "))

@@ -341,13 +341,6 @@ static void zero_pad(const float *x, float *y, struct pad s) {
     }
 }
 
-/* == scale */
-static void scale(float *x, int n, float factor, float offset) {
-    for (int i = 0; i < n; i++) {
-        x[i] = x[i] * factor + offset;
-    }
-}
-
 /* == scale_channels */
 /* Batch normalisation: a factor and an offset for each channel. */
 static void scale_channels(float *x, int n, const float *factor, const float *offset, int positions) {
@@ -357,10 +350,8 @@ static void scale_channels(float *x, int n, const float *factor, const float *of
 }
 
 /* == relu */
-static void relu(float *x, int n) {
-    for (int i = 0; i < n; i++) {
-        x[i] = x[i] > 0.0f ? x[i] : 0.0f;
-    }
+static float relu(float x) {
+    return x > 0.0f ? x : 0.0f;
 }
 
 /* == prelu */
@@ -388,31 +379,30 @@ static float expm1_of_negative(float x) {
 }
 
 /* == elu */
-static void elu(float *x, int n, float alpha) {
-    for (int i = 0; i < n; i++) {
-        x[i] = x[i] > 0.0f ? x[i] : alpha * expm1_of_negative(x[i]);
-    }
+static float elu(float x, float alpha) {
+    return x > 0.0f ? x : alpha * expm1_of_negative(x);
 }
 
 /* == hyperbolic_tangent */
-static void hyperbolic_tangent(float *x, int n) {
-    for (int i = 0; i < n; i++) {
-        float e = expm1_of_negative(x[i] > 0.0f ? -2.0f * x[i] : 2.0f * x[i]);
-        float size = -e / (e + 2.0f);
-        x[i] = x[i] > 0.0f ? size : -size;
-    }
+static float hyperbolic_tangent(float x) {
+    float e = expm1_of_negative(x > 0.0f ? -2.0f * x : 2.0f * x);
+    float size = -e / (e + 2.0f);
+    return x > 0.0f ? size : -size;
 }
 
 /* == leaky_relu */
-static void leaky_relu(float *x, int n, float slope) {
-    for (int i = 0; i < n; i++) {
-        x[i] = x[i] > 0.0f ? x[i] : slope * x[i];
-    }
+static float leaky_relu(float x, float slope) {
+    return x > 0.0f ? x : slope * x;
 }
 
 /* == softsign */
-static void softsign(float *x, int n) {
-    for (int i = 0; i < n; i++) {
-        x[i] = x[i] / (1.0f + (x[i] > 0.0f ? x[i] : -x[i]));
-    }
+static float softsign(float x) {
+    return x / (1.0f + (x > 0.0f ? x : -x));
+}
+
+/* == sigmoid */
+/* 1 / (1 + e^-x), from e^-|x|. */
+static float sigmoid(float x) {
+    float e = expm1_of_negative(x > 0.0f ? -x : x);
+    return x > 0.0f ? 1.0f / (e + 2.0f) : (e + 1.0f) / (e + 2.0f);
 }

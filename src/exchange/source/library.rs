@@ -355,11 +355,6 @@ fn zero_pad(x: &[f32], y: &mut [f32], s: Pad) {
     }
 }
 
-// == scale
-fn scale(x: &mut [f32], factor: f32, offset: f32) {
-    x.iter_mut().for_each(|x| *x = *x * factor + offset);
-}
-
 // == scale_channels
 /// Batch normalisation: a factor and an offset for each channel.
 fn scale_channels(x: &mut [f32], factor: &[f32], offset: &[f32], positions: usize) {
@@ -369,8 +364,8 @@ fn scale_channels(x: &mut [f32], factor: &[f32], offset: &[f32], positions: usiz
 }
 
 // == relu
-fn relu(x: &mut [f32]) {
-    x.iter_mut().for_each(|x| *x = if *x > 0.0 { *x } else { 0.0 });
+fn relu(x: f32) -> f32 {
+    if x > 0.0 { x } else { 0.0 }
 }
 
 // == prelu
@@ -394,25 +389,30 @@ fn expm1_of_negative(x: f32) -> f32 {
 }
 
 // == elu
-fn elu(x: &mut [f32], alpha: f32) {
-    x.iter_mut().for_each(|x| *x = if *x > 0.0 { *x } else { alpha * expm1_of_negative(*x) });
+fn elu(x: f32, alpha: f32) -> f32 {
+    if x > 0.0 { x } else { alpha * expm1_of_negative(x) }
 }
 
 // == hyperbolic_tangent
-fn hyperbolic_tangent(x: &mut [f32]) {
-    for x in x {
-        let e = expm1_of_negative(if *x > 0.0 { -2.0 * *x } else { 2.0 * *x });
-        let size = -e / (e + 2.0);
-        *x = if *x > 0.0 { size } else { -size };
-    }
+fn hyperbolic_tangent(x: f32) -> f32 {
+    let e = expm1_of_negative(if x > 0.0 { -2.0 * x } else { 2.0 * x });
+    let size = -e / (e + 2.0);
+    if x > 0.0 { size } else { -size }
 }
 
 // == leaky_relu
-fn leaky_relu(x: &mut [f32], slope: f32) {
-    x.iter_mut().for_each(|x| *x = if *x > 0.0 { *x } else { slope * *x });
+fn leaky_relu(x: f32, slope: f32) -> f32 {
+    if x > 0.0 { x } else { slope * x }
 }
 
 // == softsign
-fn softsign(x: &mut [f32]) {
-    x.iter_mut().for_each(|x| *x /= 1.0 + if *x > 0.0 { *x } else { -*x });
+fn softsign(x: f32) -> f32 {
+    x / (1.0 + if x > 0.0 { x } else { -x })
+}
+
+// == sigmoid
+/// `1 / (1 + e^-x)`, from `e^-|x|`.
+fn sigmoid(x: f32) -> f32 {
+    let e = expm1_of_negative(if x > 0.0 { -x } else { x });
+    if x > 0.0 { 1.0 / (e + 2.0) } else { (e + 1.0) / (e + 2.0) }
 }

@@ -10,7 +10,7 @@ mod rust;
 
 use steersman_kernels::Isa;
 
-use super::chain::{Op, Step, chain, check_finite, fold_batch_norm};
+use super::chain::{chain, check_finite, fold_batch_norm};
 use crate::error::{Error, Result};
 use crate::model_file::Model;
 
@@ -35,16 +35,12 @@ const MAX_NUMBERS: usize = 1 << 22;
 pub fn source(model: &Model, language: Language) -> Result<String> {
     let steps = fold_batch_norm(chain(&model.recipe.network(Isa::PORTABLE)?, &model.parameters));
     check_finite(&steps)?;
-    for Step { name, op, .. } in &steps {
-        let numbers = match op {
-            Op::Conv { weight, .. } | Op::Dense { weight, .. } => weight.len(),
-            Op::PRelu { slopes } => slopes.len(),
-            _ => 0,
-        };
+    for step in &steps {
+        let numbers = step.weight_len();
         if numbers > MAX_NUMBERS {
             let message =
                 format!("{numbers} weights are too many for a source file (at most {MAX_NUMBERS}); export to onnx");
-            return Err(Error::Network { layer: name.clone(), message });
+            return Err(Error::Network { layer: step.name.clone(), message });
         }
     }
     let program = program::Program::new(&model.recipe, &steps);

@@ -4,8 +4,9 @@ use std::ops::Range;
 
 use crate::dataset::colour::{Colour, HSV, L_SCALE, L_SHIFT, LAB};
 use crate::dataset::resize::{AreaTaps, LinearTap, Method, Resizer};
+use crate::engine::layers::{ExportForm, Formula, Function};
 use crate::engine::tensor::Shape;
-use crate::exchange::chain::{Affine, Op, Step, scale_and_shift};
+use crate::exchange::chain::{Affine, Step, scale_and_shift};
 use crate::recipe::Recipe;
 
 /// Everything that the file of a model says.
@@ -20,7 +21,7 @@ pub struct Program<'a> {
     /// Arrays that the calls name.
     pub arrays: Vec<Array>,
     pub buffers: Vec<(Buffer, usize)>,
-    pub calls: Vec<Call>,
+    pub statements: Vec<Statement>,
     /// Where the steering stands in the end.
     pub result: Buffer,
 }
@@ -63,11 +64,16 @@ impl Buffer {
 }
 
 /// One statement of `steer`.
-pub struct Call {
-    /// What it is for, where that is not the same as for the call before.
-    pub comment: Option<String>,
-    pub function: &'static str,
-    pub args: Vec<Arg>,
+pub enum Statement {
+    /// Calls a function of the library.
+    Call {
+        /// What it is for, where that is not the same as for the call before.
+        comment: Option<String>,
+        function: &'static str,
+        args: Vec<Arg>,
+    },
+    /// Puts the formula of each of the first `len` numbers of a buffer in its place.
+    Map { comment: String, buffer: Buffer, len: usize, formula: Formula },
 }
 
 pub enum Arg {
@@ -100,8 +106,44 @@ fn needs(function: &str) -> &'static [&'static str] {
         "hls" => &["extremes", "round_half_even"],
         "lab" => &["descale", "clamp_level"],
         "max_pool" | "average_pool" => &["pool"],
-        "elu" | "hyperbolic_tangent" => &["exp"],
+        "elu" | "hyperbolic_tangent" | "sigmoid" => &["exp"],
         _ => &[],
+    }
+}
+
+/// Name in the library and constant of a function.
+fn library_function(function: Function) -> (&'static str, Option<f32>) {
+    match function {
+        Function::Relu => ("relu", None),
+        Function::Elu { alpha } => ("elu", Some(alpha)),
+        Function::LeakyRelu { slope } => ("leaky_relu", Some(slope)),
+        Function::Tanh => ("hyperbolic_tangent", None),
+        Function::Softsign => ("softsign", None),
+        Function::Sigmoid => ("sigmoid", None),
+    }
+}
+
+/// `formula` as an expression of C and Rust, where `x` is the input value and `number` writes a constant.
+pub fn expression(formula: &Formula, x: &str, number: fn(f32) -> String) -> String {
+    let part = |formula: &Formula| expression(formula, x, number);
+    let factor = |formula: &Formula| match formula {
+        Formula::Sum(_) => format!("({})", part(formula)),
+        _ => part(formula),
+    };
+    match formula {
+        Formula::X => x.into(),
+        Formula::Number(value) => number(*value),
+        Formula::Sum(terms) => format!("{} + {}", part(&terms[0]), part(&terms[1])),
+        // Factors in parentheses where the order of the roundings depends on it.
+        Formula::Product(factors) => match &factors[1] {
+            Formula::Product(_) => format!("{} * ({})", factor(&factors[0]), part(&factors[1])),
+            last => format!("{} * {}", factor(&factors[0]), factor(last)),
+        },
+        Formula::Apply(function, argument) => {
+            let (name, constant) = library_function(*function);
+            let args = [part(argument)].into_iter().chain(constant.map(number));
+            format!("{name}({})", args.collect::<Vec<_>>().join(", "))
+        }
     }
 }
 
@@ -114,7 +156,7 @@ impl<'a> Program<'a> {
             sections: Vec::new(),
             arrays: Vec::new(),
             buffers: Vec::new(),
-            calls: Vec::new(),
+            statements: Vec::new(),
             result: Buffer::A,
         };
         program.preprocess();
@@ -124,13 +166,29 @@ impl<'a> Program<'a> {
         program
     }
 
+    /// The sections of the library that hold the functions in `formula`.
+    fn need_functions_of(&mut self, formula: &Formula) {
+        match formula {
+            Formula::X | Formula::Number(_) => {}
+            Formula::Sum(parts) | Formula::Product(parts) => {
+                parts.iter().for_each(|part| self.need_functions_of(part));
+            }
+            Formula::Apply(function, argument) => {
+                let (name, _) = library_function(*function);
+                self.sections.extend(needs(name));
+                self.sections.push(name);
+                self.need_functions_of(argument);
+            }
+        }
+    }
+
     fn call(&mut self, comment: Option<String>, function: &'static str, args: Vec<Arg>) {
         let named = args.iter().filter_map(|arg| if let Arg::Function(name) = arg { Some(*name) } else { None });
         for function in [function].into_iter().chain(named) {
             self.sections.extend(needs(function));
             self.sections.push(function);
         }
-        self.calls.push(Call { comment, function, args });
+        self.statements.push(Statement::Call { comment, function, args });
     }
 
     fn array(&mut self, name: String, values: Values) -> Arg {
@@ -262,11 +320,11 @@ impl<'a> Program<'a> {
     }
 
     fn step(&mut self, step: &Step) {
-        let Step { name, input, output, op } = step;
+        let Step { name, input, output, form } = step;
         let array = |what: &str| format!("{name}_{what}");
         let change = |program: &Program| Arg::Change(program.result, input.len());
-        match op {
-            Op::Conv { kernel, stride, pads, weight, bias } => {
+        match form {
+            ExportForm::Conv { kernel, stride, pads, weight, bias } => {
                 let weight = self.array(array("weight"), Values::F32(weight.clone()));
                 let bias = self.array(array("bias"), Values::F32(bias.clone()));
                 let mut sizes = map_sizes(*input);
@@ -277,12 +335,12 @@ impl<'a> Program<'a> {
                 sizes.extend([("out_h", output.h), ("out_w", output.w)]);
                 self.map_call(step, "conv2d", vec![weight, bias, Arg::Sizes("conv", sizes)]);
             }
-            Op::Dense { weight, bias } => {
+            ExportForm::Dense { weight, bias } => {
                 let weight = self.array(array("weight"), Values::F32(weight.clone()));
                 let bias = self.array(array("bias"), Values::F32(bias.clone()));
                 self.map_call(step, "dense", vec![weight, bias, Arg::Int(input.len()), Arg::Int(output.len())]);
             }
-            Op::BatchNorm { gamma, beta, mean, variance, epsilon } => {
+            ExportForm::BatchNorm { gamma, beta, mean, variance, epsilon } => {
                 let Affine { scale, shift } = scale_and_shift(gamma, beta, mean, variance, *epsilon);
                 let numbers = |values: Vec<f64>| Values::F32(values.into_iter().map(|value| value as f32).collect());
                 let scale = self.array(array("scale"), numbers(scale));
@@ -290,42 +348,36 @@ impl<'a> Program<'a> {
                 let args = vec![change(self), scale, shift, Arg::Int(input.positions())];
                 self.call(Some(name.clone()), "scale_channels", args);
             }
-            Op::Scale { factor, offset } => {
-                let args = vec![change(self), Arg::Float(*factor), Arg::Float(*offset)];
-                self.call(Some(name.clone()), "scale", args);
+            ExportForm::Elementwise(formula) => {
+                self.need_functions_of(formula);
+                let (buffer, len) = (self.result, input.len());
+                self.statements.push(Statement::Map { comment: name.clone(), buffer, len, formula: formula.clone() });
             }
-            Op::Relu => self.call(Some(name.clone()), "relu", vec![change(self)]),
-            Op::Elu { alpha } => self.call(Some(name.clone()), "elu", vec![change(self), Arg::Float(*alpha)]),
-            Op::LeakyRelu { slope } => {
-                self.call(Some(name.clone()), "leaky_relu", vec![change(self), Arg::Float(*slope)]);
-            }
-            Op::Tanh => self.call(Some(name.clone()), "hyperbolic_tangent", vec![change(self)]),
-            Op::Softsign => self.call(Some(name.clone()), "softsign", vec![change(self)]),
-            Op::PRelu { slopes } => {
+            ExportForm::PRelu { slopes } => {
                 let repeat = Arg::Int(input.len() / slopes.len());
                 let slopes = self.array(array("slope"), Values::F32(slopes.clone()));
                 self.call(Some(name.clone()), "prelu", vec![change(self), slopes, repeat]);
             }
-            Op::MaxPool { window, stride } => {
+            ExportForm::MaxPool { window, stride } => {
                 let sizes = pool_sizes(*input, *output, *window, *stride);
                 self.map_call(step, "max_pool", vec![sizes]);
             }
-            Op::AveragePool { window, stride } => {
+            ExportForm::AveragePool { window, stride } => {
                 let sizes = pool_sizes(*input, *output, *window, *stride);
                 self.map_call(step, "average_pool", vec![sizes]);
             }
-            Op::Crop { top, left } => {
+            ExportForm::Crop { top, left } => {
                 let mut sizes = map_sizes(*input);
                 sizes.extend([("top", *top), ("left", *left), ("out_h", output.h), ("out_w", output.w)]);
                 self.map_call(step, "crop", vec![Arg::Sizes("crop", sizes)]);
             }
-            Op::ZeroPad { top, left } => {
+            ExportForm::ZeroPad { top, left } => {
                 let mut sizes = map_sizes(*input);
                 sizes.extend([("top", *top), ("left", *left), ("out_h", output.h), ("out_w", output.w)]);
                 self.map_call(step, "zero_pad", vec![Arg::Sizes("pad", sizes)]);
             }
             // A map is laid out as the vector is.
-            Op::Flatten => {}
+            ExportForm::Flatten | ExportForm::Identity => {}
         }
     }
 

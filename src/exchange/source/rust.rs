@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use super::program::{Arg, Array, Call, Program, Values, pick_sections, statement, wrap};
+use super::program::{Arg, Array, Program, Statement, Values, expression, pick_sections, statement, wrap};
 
 const LIBRARY: &str = include_str!("library.rs");
 
@@ -56,12 +56,21 @@ fn write_to(text: &mut String, program: &Program) -> std::fmt::Result {
          /// times [`FULL_LOCK_DEG`] it is degrees of the front wheels. An image of another size has to be scaled before.\n    \
          pub fn steer(&mut self, image: &[u8; HEIGHT * WIDTH * 3]) -> f32 {{\n        let Model {{ {names} }} = self;"
     )?;
-    for Call { comment, function, args } in &program.calls {
-        if let Some(comment) = comment {
-            writeln!(text, "        // {comment}")?;
+    for step in &program.statements {
+        match step {
+            Statement::Call { comment, function, args } => {
+                if let Some(comment) = comment {
+                    writeln!(text, "        // {comment}")?;
+                }
+                let args: Vec<String> = args.iter().map(argument).collect();
+                writeln!(text, "{}", statement(function, &args, "        "))?;
+            }
+            Statement::Map { comment, buffer, len, formula } => {
+                let value = expression(formula, "*x", |value| format!("{value:?}"));
+                writeln!(text, "        // {comment}\n        for x in &mut {}[..{len}] {{", buffer.name())?;
+                writeln!(text, "            *x = {value};\n        }}")?;
+            }
         }
-        let args: Vec<String> = args.iter().map(argument).collect();
-        writeln!(text, "{}", statement(function, &args, "        "))?;
     }
     writeln!(text, "        {}[0]\n    }}\n}}\n", program.result.name())?;
     writeln!(text, "impl Default for Model {{\n    fn default() -> Model {{\n        Model::new()\n    }}\n}}\n")?;

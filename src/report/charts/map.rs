@@ -4,7 +4,7 @@ use crate::error::{Error, Result};
 use crate::files::new_folder::NewFolder;
 use crate::report::charts::palette::{INK, QUIET_INK, heat_hex};
 use crate::report::charts::svg::{Anchor, Svg};
-use crate::simulator::trial::run::Moment;
+use crate::simulator::trial::outcome::Moment;
 use crate::simulator::{DriveResult, DriveSummary, Track};
 
 /// Distance from the line that has the darkest colour, m.
@@ -37,7 +37,7 @@ const PAGE: [f64; 2] = [760.0, 620.0];
 pub fn write(track: &Track, result: &DriveResult, folder: &NewFolder) -> Result<()> {
     let place = |m: &Moment| MapPoint { x: m.x, y: m.y, cte_m: m.cte_m, put_back: m.intervention };
     let drives: Vec<Vec<MapPoint>> =
-        result.runs.iter().map(|pair| pair.assisted.moments.iter().map(place).collect()).collect();
+        result.trials.iter().map(|pair| pair.assisted.moments.iter().map(place).collect()).collect();
     let DriveSummary { runs, interventions, .. } = result.summary;
     let title = format!("{}, runs: {runs}, put back: {interventions}", track.name());
     let path = folder.unfinished().join("map.svg");

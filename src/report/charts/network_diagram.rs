@@ -1,6 +1,7 @@
 //! The diagram of a network: one block for each layer that changes the shape, with what is done to its output written below.
 
-use crate::engine::network::{LayerSpec, Network, group_digits};
+use crate::engine::layers::Family;
+use crate::engine::network::{Network, group_digits};
 use crate::engine::tensor::Shape;
 use crate::report::charts::palette::{BLUE, GREEN, INK, ORANGE, PALE, QUIET_INK};
 use crate::report::charts::svg::{Anchor, Svg};
@@ -29,20 +30,12 @@ fn stages(network: &Network) -> Vec<Stage> {
     let input = network.input();
     let mut stages = vec![Stage { name: "input".into(), colour: PALE, shape: input, lines: Vec::new(), params: 0 }];
     for layer in network.layers() {
-        let colour = match layer.spec {
-            LayerSpec::Conv2d { .. } => Some(BLUE),
-            LayerSpec::MaxPool { .. } | LayerSpec::AveragePool { .. } => Some(GREEN),
-            LayerSpec::Dense { .. } => Some(ORANGE),
-            LayerSpec::Flatten {} | LayerSpec::Crop { .. } | LayerSpec::ZeroPad { .. } => Some(PALE),
-            LayerSpec::BatchNorm { .. }
-            | LayerSpec::Relu {}
-            | LayerSpec::Elu { .. }
-            | LayerSpec::PRelu { .. }
-            | LayerSpec::LeakyRelu { .. }
-            | LayerSpec::Tanh {}
-            | LayerSpec::Softsign {}
-            | LayerSpec::Dropout { .. }
-            | LayerSpec::Scale { .. } => None,
+        let colour = match layer.spec.family() {
+            Family::Convolution => Some(BLUE),
+            Family::Pooling => Some(GREEN),
+            Family::Dense => Some(ORANGE),
+            Family::Rearrangement => Some(PALE),
+            Family::Activation | Family::Normalization | Family::Regularization => None,
         };
         let (what, params) = (layer.spec.describe(), layer.params.len() + layer.statistics.len());
         match (colour, stages.last_mut()) {

@@ -279,7 +279,7 @@ fn judge(
             Effect {
                 change,
                 mean_moved_deg,
-                p95_moved_deg: crate::simulator::trial::statistics::quantile(&distances, 0.95),
+                p95_moved_deg: crate::statistics::quantile(&distances, 0.95),
                 bias_deg: mean(&moved),
                 right_way_share,
                 mae_deg: mae(k + 1, if change == Change::Mirror { -1.0 } else { 1.0 }),

@@ -3,7 +3,8 @@
 use super::counterfactual::Change;
 use super::footage::{Footage, Projector};
 use super::saliency::Saliency;
-use crate::engine::network::LayerSpec;
+use crate::engine::layers::{Family, ReceptiveField};
+use crate::engine::network::NamedLayer;
 use crate::error::Result;
 use crate::picture::RgbImage;
 use crate::pilot::Pilot;
@@ -91,7 +92,7 @@ pub fn exhibits(pilot: &Pilot, footage: &Footage, steering: &[f32]) -> Result<Ex
 /// The filters of the first convolution; with three input planes, as colours. `None` without a convolution.
 fn filters(pilot: &Pilot) -> Option<Exhibit> {
     let network = pilot.network();
-    let layer = network.layers().iter().find(|layer| matches!(layer.spec, LayerSpec::Conv2d { .. }))?;
+    let layer = network.layers().iter().find(|layer| layer.spec.family() == Family::Convolution)?;
     let tensor = network.tensors().iter().find(|tensor| tensor.name == format!("{}.weight", layer.name))?;
     let weights = pilot.parameters().tensor(tensor);
     let [oc, c, kh, kw] = tensor.spec.shape[..] else { return None };
@@ -124,25 +125,13 @@ fn features(pilot: &mut Pilot, image: &RgbImage) -> Result<Vec<Exhibit>> {
     let layers = pilot.network().layers();
     let mut exhibits = Vec::new();
     for (index, layer) in layers.iter().enumerate() {
-        if !matches!(layer.spec, LayerSpec::Conv2d { .. }) {
+        if layer.spec.family() != Family::Convolution {
             continue;
         }
-        // As the maps leave the activation: at the last of the layers after it that keep the shape.
-        let keeps = |spec: &LayerSpec| {
-            matches!(
-                spec,
-                LayerSpec::BatchNorm { .. }
-                    | LayerSpec::Relu {}
-                    | LayerSpec::Elu { .. }
-                    | LayerSpec::LeakyRelu { .. }
-                    | LayerSpec::Tanh {}
-                    | LayerSpec::Softsign {}
-                    | LayerSpec::PRelu { .. }
-                    | LayerSpec::Dropout { .. }
-                    | LayerSpec::Scale { .. }
-            )
-        };
-        let after = layers[index + 1..].iter().take_while(|layer| keeps(&layer.spec)).count();
+        // As the maps leave the activation: after the layers behind the convolution that see each value alone.
+        let keeps_maps =
+            |layer: &&NamedLayer| layer.spec.receptive_field(layer.layer.input()) == ReceptiveField::Element;
+        let after = layers[index + 1..].iter().take_while(keeps_maps).count();
         let Some((_, maps)) = seen.iter().find(|(at, _)| *at == index + after) else { continue };
         let shape = layer.layer.output();
         let tiles: Vec<RgbImage> =

@@ -6,7 +6,8 @@ use crate::dataset::{self, View};
 use crate::error::{Error, Result};
 use crate::picture::{RgbImage, decode::decode_rgb};
 use crate::simulator::camera::jpeg::RoundTrip;
-use crate::simulator::recorder::record::{Sample, drive_expert};
+use crate::simulator::recorder::expert_drive::drive_expert;
+use crate::simulator::recorder::sample::Sample;
 use crate::simulator::{Camera, HEIGHT, Mount, RecordOptions, Renderer, RgbFrame, Track, Variant, WIDTH};
 
 /// Where the pictures come from.

@@ -9,7 +9,8 @@
 //! It shows what *excites* the layers, not what the steering depends on: that is what [`crate::report::explain::counterfactual`] measures.
 
 use crate::dataset::preprocess::Preprocessing;
-use crate::engine::network::{LayerSpec, Network};
+use crate::engine::layers::{Family, ReceptiveField};
+use crate::engine::network::Network;
 use crate::error::{Error, Result};
 use crate::picture::RgbImage;
 use crate::pilot::Pilot;
@@ -78,41 +79,22 @@ impl Saliency {
                     |k: usize, from, to| Axis { from, to, kernel: kernel[k], stride: stride[k], before: before[k] };
                 Step::Spread([axis(0, input.h, output.h), axis(1, input.w, output.w)])
             };
-            match named.spec {
-                LayerSpec::Conv2d { kernel, stride, padding, .. } => {
-                    let before = |k: usize, size| padding.amounts(size, kernel[k], stride[k]).0 as isize;
-                    steps.push(axes(kernel, stride, [before(0, input.h), before(1, input.w)]));
-                    means.push(Mean { layer: index, channels: output.c, values: vec![0.0; output.positions()] });
-                    steps.push(Step::Multiply(means.len() - 1));
-                    after_convolution = true;
+            match named.spec.receptive_field(input) {
+                ReceptiveField::Window { size, stride, before } => {
+                    steps.push(axes(size, stride, before));
+                    after_convolution = named.spec.family() == Family::Convolution;
+                    if after_convolution {
+                        means.push(Mean { layer: index, channels: output.c, values: vec![0.0; output.positions()] });
+                        steps.push(Step::Multiply(means.len() - 1));
+                    }
                 }
-                LayerSpec::MaxPool { window, stride } | LayerSpec::AveragePool { window, stride } => {
-                    steps.push(axes(window, stride.unwrap_or(window), [0, 0]));
-                    after_convolution = false;
-                }
-                LayerSpec::Crop { rows, columns } => {
-                    steps.push(axes([1, 1], [1, 1], [-(rows[0] as isize), -(columns[0] as isize)]));
-                    after_convolution = false;
-                }
-                LayerSpec::ZeroPad { rows, columns } => {
-                    steps.push(axes([1, 1], [1, 1], [rows[0] as isize, columns[0] as isize]));
-                    after_convolution = false;
-                }
-                LayerSpec::BatchNorm { .. }
-                | LayerSpec::Relu {}
-                | LayerSpec::LeakyRelu { .. }
-                | LayerSpec::Elu { .. }
-                | LayerSpec::PRelu { .. }
-                | LayerSpec::Tanh {}
-                | LayerSpec::Softsign {}
-                | LayerSpec::Dropout { .. }
-                | LayerSpec::Scale { .. } => {
-                    // The map counts as it leaves the activation.
+                // The map counts as it leaves the activation.
+                ReceptiveField::Element => {
                     if let Some(mean) = means.last_mut().filter(|_| after_convolution) {
                         mean.layer = index;
                     }
                 }
-                LayerSpec::Flatten {} | LayerSpec::Dense { .. } => break,
+                ReceptiveField::All => break,
             }
         }
         // Beyond the last convolution nothing is multiplied, so nothing needs to be spread.
@@ -363,8 +345,12 @@ mod tests {
 
     #[test]
     fn a_network_without_convolution_has_none() {
-        let network =
-            Network::new(crate::engine::tensor::Shape::new(1, 4, 4), &[LayerSpec::Flatten {}], Isa::PORTABLE).unwrap();
+        let network = Network::new(
+            crate::engine::tensor::Shape::new(1, 4, 4),
+            &[crate::engine::layers::FlattenSpec {}.into()],
+            Isa::PORTABLE,
+        )
+        .unwrap();
         assert!(Saliency::new(&network).unwrap_err().to_string().contains("no convolution"));
     }
 }

@@ -10,8 +10,8 @@ use crate::error::{Error, Result};
 use crate::observer::{Observer, Progress};
 use crate::picture::RgbImage;
 use crate::simulator::car::dynamics::MAX_STEER_DEG;
-use crate::simulator::trial::run::{DRIVE_HZ, Failure};
-use crate::simulator::{DriveEvent, DriveFrame, Driver, HEIGHT, Run, RunOptions, Track, WIDTH, run_observed};
+use crate::simulator::trial::outcome::{DRIVE_HZ, Failure};
+use crate::simulator::{DriveEvent, DriveFrame, Driver, HEIGHT, Track, Trial, TrialOptions, WIDTH, run_trial_observed};
 
 /// A video of a run that is yet to be driven.
 pub struct DriveVideo {
@@ -48,7 +48,7 @@ impl DriveVideo {
         Ok(DriveVideo { video, frame, onlooker })
     }
 
-    /// Drives the run `seed`, as [`run`](crate::simulator::trial::run::run) does and to the same bits, and writes the video. `observer`
+    /// Drives the run `seed`, as [`run`](crate::simulator::trial::run::run_trial) does and to the same bits, and writes the video. `observer`
     /// is told the share of the way that is made. If it returns [`Error::Interrupted`], what there is by then is written, and the
     /// second value is `true`.
     ///
@@ -59,12 +59,12 @@ impl DriveVideo {
         mut self,
         track: &Track,
         driver: &mut dyn Driver,
-        options: &RunOptions,
+        options: &TrialOptions,
         seed: u64,
         observer: &mut dyn Observer<Progress>,
     ) -> Result<(VideoSummary, bool)> {
         let looks = driver.needs_frame();
-        match run_observed(track, driver, options, seed, &mut FilmObserver { film: &mut self, looks, observer }) {
+        match run_trial_observed(track, driver, options, seed, &mut FilmObserver { film: &mut self, looks, observer }) {
             Ok(run) => Ok((self.video.finish(&outcome(&run, options))?, false)),
             Err(Error::Interrupted) => Ok((self.video.finish("stopped")?, true)),
             Err(error) => Err(error),
@@ -105,7 +105,7 @@ impl FilmObserver<'_> {
 }
 
 /// What a run came to, in a few words.
-fn outcome(run: &Run, options: &RunOptions) -> String {
+fn outcome(run: &Trial, options: &TrialOptions) -> String {
     let time_s = run.time_s;
     match run.failure {
         Some(Failure::Crash) => format!("hit a wall after {time_s:.1} s"),

@@ -10,10 +10,10 @@ use super::summary::VideoSummary;
 use crate::error::{Error, Result};
 use crate::observer::{Observer, Progress};
 use crate::picture::RgbImage;
-use crate::simulator::camera::eye::Eye;
+use crate::simulator::camera::front_camera::FrontCamera;
 use crate::simulator::car::dynamics::{MAX_STEER_DEG, MPS_PER_MPH};
 use crate::simulator::car::expert;
-use crate::simulator::trial::run::DRIVE_HZ;
+use crate::simulator::trial::outcome::DRIVE_HZ;
 use crate::simulator::trial::trajectory::{Waypoint, read_summary, read_trajectory, trajectories};
 use crate::simulator::{HEIGHT, Simulation, Track, WIDTH};
 
@@ -65,7 +65,7 @@ pub fn film(
     };
     let painter = Painter::new(names, Some(&track));
     let mut video = Video::create(out, painter, fps.unwrap_or(DRIVE_HZ as f64))?;
-    let mut eye = Eye::new(&track, seed);
+    let mut eye = FrontCamera::new(&track, seed);
     let mut frame = FilmFrame { picture: RgbImage::filled(HEIGHT, WIDTH, [0; 3]), ..FilmFrame::default() };
     let (mut stopped, mut put_back) = (false, 0);
     for (k, (waypoint, heading_deg)) in way.iter().zip(&poses).enumerate() {

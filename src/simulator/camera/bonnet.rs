@@ -3,7 +3,7 @@
 use std::ops::Range;
 
 use crate::simulator::camera::pinhole::{HEIGHT, Mount, RgbFrame, WIDTH};
-use crate::simulator::camera::renderer::SPAN;
+use crate::simulator::camera::view::SPAN;
 use crate::simulator::scenery::light::Variant;
 
 /// Row at which the bonnet begins in a column; `HEIGHT` where there is none.

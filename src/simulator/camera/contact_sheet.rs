@@ -6,8 +6,8 @@ use crate::simulator::camera::pinhole::{Camera, HEIGHT, Mount, RgbFrame, WIDTH};
 use crate::simulator::camera::renderer::Renderer;
 use crate::simulator::car::dynamics::MPS_PER_MPH;
 use crate::simulator::car::simulation::{Simulation, Start};
-use crate::simulator::road::track::Track;
 use crate::simulator::scenery::light::Variant;
+use crate::simulator::track::Track;
 
 /// Pixels between pictures.
 const GAP: usize = 4;

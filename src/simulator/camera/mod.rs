@@ -1,9 +1,10 @@
 //! Cameras, and how they see the scenery.
 
-pub(crate) mod bonnet;
+mod bonnet;
 pub mod contact_sheet;
-pub mod eye;
+pub mod front_camera;
 pub mod jpeg;
-pub(crate) mod objects;
+mod objects;
 pub mod pinhole;
 pub mod renderer;
+mod view;

@@ -1,10 +1,10 @@
 //! Draws what stands upright on the ground: walls and things beside the road.
 
 use crate::simulator::camera::pinhole::{FOCAL_PX, HEIGHT, RgbFrame, WIDTH};
-use crate::simulator::camera::renderer::{FULL, View};
+use crate::simulator::camera::view::{FULL, View};
 use crate::simulator::math::{Vec3, hash2, lerp};
 use crate::simulator::road::spec::Wall;
-use crate::simulator::scenery::terrain::fixed;
+use crate::simulator::scenery::texel::fixed;
 use crate::simulator::scenery::world::{Sprite, WallPiece};
 
 /// Nothing nearer than this is drawn, m.

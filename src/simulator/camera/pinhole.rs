@@ -1,5 +1,6 @@
 //! The cameras of Udacity's car: where they sit, where they look, and which pixel shows which point.
 
+use crate::simulator::car::pose::BodyPose;
 use crate::simulator::math::{Vec3, sin_cos, vec3};
 
 /// Width of a picture, pixels.
@@ -58,19 +59,6 @@ impl Mount {
 
 /// Downward pitch, yaw to the right and roll (right side up) of every camera in the body, deg.
 pub const PITCH_YAW_ROLL_DEG: [f64; 3] = [9.5, 0.723, 1.201];
-
-/// The body of the car in the world: where it stands and its axes (unit, perpendicular).
-#[derive(Clone, Copy, Debug)]
-pub struct BodyPose {
-    /// Middle of the car, on the ground.
-    pub origin: Vec3,
-    /// Forward.
-    pub forward: Vec3,
-    /// To the right.
-    pub right: Vec3,
-    /// Up from the roof.
-    pub up: Vec3,
-}
 
 /// A camera placed in the world.
 #[derive(Clone, Copy, Debug)]

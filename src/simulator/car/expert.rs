@@ -84,7 +84,7 @@ mod tests {
     use super::*;
     use crate::simulator::car::dynamics::{Controls, MPS_PER_MPH};
     use crate::simulator::car::simulation::Start;
-    use crate::simulator::road::track::Track;
+    use crate::simulator::track::Track;
 
     #[test]
     fn a_car_left_of_the_line_is_steered_right() {

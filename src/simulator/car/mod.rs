@@ -4,5 +4,6 @@ pub mod dynamics;
 pub mod expert;
 pub mod keys;
 pub mod noise;
+pub mod pose;
 pub mod simulation;
 pub mod speed;

@@ -1,10 +1,10 @@
 //! A car on a track: what happens in one step, and where the car is relative to the road.
 
-use crate::simulator::camera::pinhole::BodyPose;
 use crate::simulator::car::dynamics::{Car, Controls, STEP_S};
+use crate::simulator::car::pose::BodyPose;
 use crate::simulator::math::{Rng, sin_cos, vec3};
-use crate::simulator::road::track::{Location, Track};
-use crate::simulator::scenery::world::{WALL_GAP_M, wall_at};
+use crate::simulator::road::line::{Location, WALL_GAP_M};
+use crate::simulator::track::Track;
 
 /// Where and how a run begins.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -159,7 +159,7 @@ impl<'a> Simulation<'a> {
             let half = self.track.stations[wheel.station].width_m / 2.0;
             self.wheels_off += usize::from(wheel.offset_m.abs() > half);
             if wheel.offset_m.abs() > half + WALL_GAP_M {
-                self.at_wall |= wall_at(self.track, wheel.s_m, wheel.offset_m > 0.0).is_some();
+                self.at_wall |= self.track.wall_at(wheel.s_m, wheel.offset_m > 0.0).is_some();
             }
         }
     }

@@ -6,30 +6,14 @@ use std::path::{Path, PathBuf};
 
 use crate::dataset::udacity_writer::{HEADER, picture_name, write_row};
 use crate::simulator::camera::jpeg;
-use crate::simulator::camera::pinhole::{BodyPose, Camera, Mount, RgbFrame};
+use crate::simulator::camera::pinhole::{Camera, Mount, RgbFrame};
 use crate::simulator::camera::renderer::Renderer;
-use crate::simulator::recorder::record::LogFormat;
-use crate::simulator::road::track::Track;
+use crate::simulator::recorder::options::LogFormat;
+use crate::simulator::recorder::sample::Sample;
 use crate::simulator::scenery::light::Variant;
 use crate::simulator::scenery::world::World;
+use crate::simulator::track::Track;
 use crate::{Error, Result};
-
-/// One row of the log before its pictures are taken.
-#[derive(Clone, Debug)]
-pub struct Sample {
-    /// Simulated time, s.
-    pub time_s: f64,
-    /// The car.
-    pub body: BodyPose,
-    /// Label: steering, [-1, 1], + = right.
-    pub steering: f64,
-    /// Throttle, 0 to 1.
-    pub throttle: f64,
-    /// Brake, 0 to 1.
-    pub brake: f64,
-    /// Speed, mph.
-    pub speed_mph: f64,
-}
 
 /// Takes the pictures of rows. Keeps its buffers.
 #[derive(Default)]

@@ -1,12 +1,14 @@
-//! Tracks without end: one for every seed.
+//! Roads without end: one for every seed.
 
 use crate::simulator::math::{Rng, sin_cos};
+use crate::simulator::road::line::Road;
 use crate::simulator::road::spec::{
     Centre, Edge, Land, Light, Look, Plant, Rgb, Side, Stretch, Surface, TrackSpec, Wall,
 };
-use crate::simulator::road::track::{FIRST_HELD_OUT_SEED, Track};
 use crate::{Error, Result};
 
+/// Random tracks with this seed or a higher one are kept out of training.
+pub const FIRST_HELD_OUT_SEED: u64 = 1_000_000;
 /// Lines that are drawn before a seed is given up.
 const ATTEMPTS: usize = 400;
 
@@ -14,18 +16,18 @@ const ATTEMPTS: usize = 400;
 /// light. Looks that only the built-in held-out tracks have are never drawn.
 ///
 /// # Errors
-/// If no line passes the checks of [`Track::from_spec`].
-pub fn generate(seed: u64) -> Result<Track> {
+/// If no line passes the checks of [`Road::from_spec`].
+pub fn generate(seed: u64) -> Result<Road> {
     let mut rng = Rng::new(seed, "track");
     let spec = looks(seed, &mut rng);
     let mut reason = None;
     for _ in 0..ATTEMPTS {
         let mut spec = spec.clone();
         spec.points = line(&mut rng);
-        match Track::from_spec(spec, &format!("random:{seed}")) {
-            Ok(mut track) => {
-                track.spec.stretch = stretches(&mut rng, track.length_m, &track.spec);
-                return Ok(track);
+        match Road::from_spec(spec, &format!("random:{seed}")) {
+            Ok(mut road) => {
+                road.spec.stretch = stretches(&mut rng, road.length_m, &road.spec);
+                return Ok(road);
             }
             Err(error) => reason = Some(error),
         }

@@ -116,6 +116,13 @@ impl TrackSpec {
     }
 }
 
+impl TrackSpec {
+    /// What the track sets at `s_m` of the lap: `setting` of the last stretch there that has one.
+    pub(crate) fn setting_at<T>(&self, s_m: f64, setting: impl Fn(&Stretch) -> Option<T>) -> Option<T> {
+        self.stretch.iter().rev().filter(|stretch| stretch.covers(s_m)).find_map(setting)
+    }
+}
+
 fn within(name: &str, value: f64, low: f64, high: f64) -> Result<(), String> {
     // Numbers kept in 32 bits have digits behind those that were written.
     let written = (value * 1e6).round() / 1e6;
@@ -222,6 +229,17 @@ pub struct Stretch {
     pub left_wall: Option<Wall>,
     /// Wall or barrier on the right.
     pub right_wall: Option<Wall>,
+}
+
+impl Stretch {
+    /// Whether `s_m` of the lap lies on the stretch.
+    fn covers(&self, s_m: f64) -> bool {
+        if self.from_m <= self.to_m {
+            (self.from_m..self.to_m).contains(&s_m)
+        } else {
+            s_m >= self.from_m || s_m < self.to_m
+        }
+    }
 }
 
 /// The shape of the land beside the road.

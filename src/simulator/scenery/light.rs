@@ -1,7 +1,8 @@
 //! What differs from run to run on the same track: light and texture.
 
 use crate::simulator::math::Rng;
-use crate::simulator::scenery::road_texture::pack;
+use crate::simulator::scenery::terrain::FULL_LIGHT;
+use crate::simulator::scenery::texel::pack;
 use crate::simulator::scenery::world::World;
 
 /// The light and texture of one run. Variant 0 of a track is what its file says; other seeds depart from it.
@@ -29,7 +30,7 @@ impl Variant {
         let depth = 1.0 + around(0.25);
         let road_shift_m = 24.0 + 12.0 * (1.0 + around(1.0));
         let road_light = std::array::from_fn(|a| {
-            let light = a as f32 / crate::simulator::scenery::terrain::FULL_LIGHT;
+            let light = a as f32 / FULL_LIGHT;
             (256.0 * (0.88 + (light - 1.0) * 0.88 * depth) * road).clamp(20.0, 256.0) as u16
         });
         let tone = tint.map(|tint| {

@@ -5,4 +5,5 @@ pub(crate) mod pictures;
 pub(crate) mod road_texture;
 pub(crate) mod sky;
 pub(crate) mod terrain;
+pub(crate) mod texel;
 pub(crate) mod world;

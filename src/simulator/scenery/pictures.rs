@@ -2,7 +2,7 @@
 
 use crate::simulator::math::{hash2, value_noise};
 use crate::simulator::road::spec::Plant;
-use crate::simulator::scenery::road_texture::pack;
+use crate::simulator::scenery::texel::pack;
 
 /// Width of a picture at its finest level, texels.
 const W: usize = 64;

@@ -8,6 +8,7 @@ use std::ops::Range;
 
 use crate::simulator::math::{hash2, lerp, smoothstep, value_noise};
 use crate::simulator::road::spec::{Centre, Edge, Look, Rgb, Surface};
+use crate::simulator::scenery::texel::pack;
 
 /// Length of the pattern along the road, m.
 pub const PERIOD_M: f32 = 24.0;
@@ -42,7 +43,7 @@ pub struct Level<'a> {
 }
 
 /// Bits behind the point of fixed-point places along the road; the unit is the finest texel. With these a whole lap of
-/// 1,500 m stays below 2^22, which [`fixed`](crate::simulator::scenery::terrain::fixed) needs.
+/// 1,500 m stays below 2^22, which [`fixed`](crate::simulator::scenery::texel::fixed) needs.
 const ALONG_BITS: u32 = 6;
 /// The same across the road.
 const ACROSS_BITS: u32 = 12;
@@ -155,12 +156,6 @@ fn average(a: u32, b: u32) -> u32 {
     let even = ((a & 0x00ff_00ff) + (b & 0x00ff_00ff) + 0x0001_0001) >> 1;
     let odd = (((a >> 8) & 0x00ff_00ff) + ((b >> 8) & 0x00ff_00ff)) >> 1;
     (even & 0x00ff_00ff) | ((odd & 0x00ff_00ff) << 8)
-}
-
-/// Packs a colour with coverage into a texel.
-pub fn pack(rgb: [f32; 3], alpha: f32) -> u32 {
-    let byte = |v: f32| v.clamp(0.0, 255.0) as u32;
-    byte(rgb[0]) | byte(rgb[1]) << 8 | byte(rgb[2]) << 16 | byte(alpha * 255.0) << 24
 }
 
 const WHITE: [f32; 3] = [232.0, 232.0, 226.0];

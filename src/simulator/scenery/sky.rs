@@ -1,9 +1,8 @@
 //! The sky and the hills on the horizon, as one picture around the whole world.
 
 use crate::simulator::math::{hash2, lerp, smoothstep, value_noise};
-use crate::simulator::road::track::Track;
-use crate::simulator::scenery::road_texture::pack;
-use crate::simulator::scenery::terrain::{clip, fixed};
+use crate::simulator::road::line::Road;
+use crate::simulator::scenery::texel::{clip, fixed, pack};
 
 /// Texels around the horizon; a power of two.
 pub const AROUND: usize = 2048;
@@ -21,8 +20,8 @@ pub struct Sky {
 
 impl Sky {
     /// Paints the sky of a track.
-    pub fn paint(track: &Track) -> Sky {
-        let (light, land) = (&track.spec.light, &track.spec.land);
+    pub fn paint(road: &Road) -> Sky {
+        let (light, land) = (&road.spec.light, &road.spec.land);
         let rgb = |c: [u8; 3]| c.map(f32::from);
         let (zenith, horizon) = (rgb(light.zenith), rgb(light.horizon));
         let mut texels = vec![0; AROUND * UP];

@@ -3,9 +3,9 @@
 use rayon::prelude::*;
 
 use crate::simulator::math::{Vec3, hash2, lerp, smoothstep, value_noise, vec3};
+use crate::simulator::road::line::{Road, Station};
 use crate::simulator::road::spec::{Land, Side, Stretch};
-use crate::simulator::road::track::Track;
-use crate::simulator::scenery::road_texture::pack;
+use crate::simulator::scenery::texel::{clip, pack, split};
 
 /// Land kept around the road on every side, m.
 const MARGIN_M: f64 = 110.0;
@@ -49,25 +49,12 @@ fn profile(side: Side) -> Profile {
     Profile { rise_m, from_m, to_m, hills }
 }
 
-/// Whether `stretch` covers the place `s_m` of the lap.
-pub fn covers(stretch: &Stretch, s_m: f64) -> bool {
-    if stretch.from_m <= stretch.to_m {
-        (stretch.from_m..stretch.to_m).contains(&s_m)
-    } else {
-        s_m >= stretch.from_m || s_m < stretch.to_m
-    }
-}
-
-/// What the last stretch covering `s_m` that says something says.
-pub fn told<T>(track: &Track, s_m: f64, what: impl Fn(&Stretch) -> Option<T>) -> Option<T> {
-    track.spec.stretch.iter().rev().filter(|s| covers(s, s_m)).find_map(what)
-}
-
 /// Profiles of all stations on one side, blended over 12 m so that the land has no steps along the road.
-fn profiles(track: &Track, what: impl Fn(&Stretch) -> Option<Side>) -> Vec<Profile> {
+fn profiles(road: &Road, what: impl Fn(&Stretch) -> Option<Side>) -> Vec<Profile> {
     const HALF: usize = 6;
-    let n = track.stations.len();
-    let raw: Vec<Profile> = (0..n).map(|i| profile(told(track, track.s_of(i), &what).unwrap_or_default())).collect();
+    let n = road.stations.len();
+    let raw: Vec<Profile> =
+        (0..n).map(|i| profile(road.spec.setting_at(road.s_of(i), &what).unwrap_or_default())).collect();
     (0..n)
         .map(|i| {
             let mut sum = Profile::default();
@@ -85,25 +72,25 @@ fn profiles(track: &Track, what: impl Fn(&Stretch) -> Option<Side>) -> Vec<Profi
 }
 
 impl Terrain {
-    /// Shapes the land of a track.
-    pub fn build(track: &Track) -> Terrain {
-        let bound = |f: &dyn Fn(&crate::simulator::road::track::Station) -> f64| {
-            track.stations.iter().map(f).fold((f64::MAX, f64::MIN), |(lo, hi), v| (lo.min(v), hi.max(v)))
+    /// Shapes the land of a road.
+    pub fn build(road: &Road) -> Terrain {
+        let bound = |f: &dyn Fn(&Station) -> f64| {
+            road.stations.iter().map(f).fold((f64::MAX, f64::MIN), |(lo, hi), v| (lo.min(v), hi.max(v)))
         };
         let ((x_min, x_max), (y_min, y_max)) = (bound(&|s| s.x), bound(&|s| s.y));
         let (x0, y0) = ((x_min - MARGIN_M).floor(), (y_min - MARGIN_M).floor());
         let (nx, ny) = ((x_max + MARGIN_M - x0) as usize + 2, (y_max + MARGIN_M - y0) as usize + 2);
-        let stations = nearest_stations(track, x0, y0, nx, ny);
+        let stations = nearest_stations(road, x0, y0, nx, ny);
         let (x0, y0, heights) = (x0 as f32, y0 as f32, vec![0.0; nx * ny]);
         let mut terrain = Terrain { x0, y0, nx, ny, heights, highest_m: 0.0, stations };
-        terrain.raise(track);
+        terrain.raise(road);
         terrain
     }
 
-    fn raise(&mut self, track: &Track) {
-        let land = &track.spec.land;
-        let sides = [profiles(track, |s| s.left), profiles(track, |s| s.right)];
-        let far = FarLand::new(track, self.x0, self.y0, self.nx, self.ny);
+    fn raise(&mut self, road: &Road) {
+        let land = &road.spec.land;
+        let sides = [profiles(road, |s| s.left), profiles(road, |s| s.right)];
+        let far = FarLand::new(road, self.x0, self.y0, self.nx, self.ny);
         let (x0, y0, nx) = (f64::from(self.x0), f64::from(self.y0), self.nx);
         let stations = &self.stations;
         let mut rough = vec![0.0f32; nx * self.ny];
@@ -118,7 +105,7 @@ impl Terrain {
                     *height = away;
                     continue;
                 }
-                let s = &track.stations[usize::from(station)];
+                let s = &road.stations[usize::from(station)];
                 let (dx, dy) = (x - s.x, y - s.y);
                 let along = dx * s.tx + dy * s.ty;
                 let right = dx * s.ty - dy * s.tx;
@@ -211,12 +198,12 @@ impl Terrain {
 }
 
 /// For every grid point the nearest station within reach.
-fn nearest_stations(track: &Track, x0: f64, y0: f64, nx: usize, ny: usize) -> Vec<u16> {
+fn nearest_stations(road: &Road, x0: f64, y0: f64, nx: usize, ny: usize) -> Vec<u16> {
     let mut nearest = vec![NO_STATION; nx * ny];
     nearest.par_chunks_mut(nx).enumerate().for_each(|(j, row)| {
         let y = y0 + j as f64;
         let mut best = vec![REACH_M * REACH_M; nx];
-        for (k, s) in track.stations.iter().enumerate() {
+        for (k, s) in road.stations.iter().enumerate() {
             let dy2 = (s.y - y) * (s.y - y);
             if dy2 >= REACH_M * REACH_M {
                 continue;
@@ -275,14 +262,14 @@ struct FarLand {
 impl FarLand {
     const CELL: f32 = 16.0;
 
-    fn new(track: &Track, x0: f32, y0: f32, nx: usize, ny: usize) -> FarLand {
+    fn new(road: &Road, x0: f32, y0: f32, nx: usize, ny: usize) -> FarLand {
         let (nx, ny) = (nx / Self::CELL as usize + 2, ny / Self::CELL as usize + 2);
         let mut heights = vec![0.0; nx * ny];
         heights.par_chunks_mut(nx).enumerate().for_each(|(j, row)| {
             for (i, height) in row.iter_mut().enumerate() {
                 let (x, y) = (f64::from(x0 + i as f32 * Self::CELL), f64::from(y0 + j as f32 * Self::CELL));
                 let (mut sum, mut weights) = (0.0, 0.0);
-                for s in track.stations.iter().step_by(6) {
+                for s in road.stations.iter().step_by(6) {
                     let square = (s.x - x) * (s.x - x) + (s.y - y) * (s.y - y) + 100.0;
                     let weight = 1.0 / (square * square);
                     sum += weight * s.z;
@@ -314,9 +301,9 @@ pub const FULL_LIGHT: f32 = 128.0;
 
 impl GroundMap {
     /// Colours the land. `shadow` tells the part of sunlight that trees let through at a texel (0 to 1).
-    pub fn build(track: &Track, terrain: &Terrain, lit: &[(f32, f32)], shadow: &[u8]) -> GroundMap {
-        let land = &track.spec.land;
-        let light = &track.spec.light;
+    pub fn build(road: &Road, terrain: &Terrain, lit: &[(f32, f32)], shadow: &[u8]) -> GroundMap {
+        let land = &road.spec.land;
+        let light = &road.spec.light;
         let (nx, ny) = (terrain.nx * 2, terrain.ny * 2);
         let tone = |rgb: [u8; 3]| rgb.map(f32::from);
         let mut texels = vec![0u32; nx * ny];
@@ -432,32 +419,6 @@ impl GroundLevel<'_> {
         // The rim of the land may be missing from coarse levels when the size is odd.
         self.texels[at.min(self.texels.len() - 1)]
     }
-}
-
-/// Brings `x` into [0, high]; the form of the comparisons compiles to two instructions.
-#[inline(always)]
-pub fn clip(x: f32, high: f32) -> f32 {
-    let x = if x > 0.0 { x } else { 0.0 };
-    if x < high { x } else { high }
-}
-
-/// The nearest whole number, for numbers below 2^22 in size; without the checks of a cast.
-#[inline(always)]
-pub fn fixed(x: f32) -> i32 {
-    // 1.5 * 2^23: the sum has the number in the low bits of its mantissa, negative ones too.
-    (x + 12_582_912.0).to_bits() as i32 - 0x4b40_0000
-}
-
-/// Whole part and rest of a number in [0, 2^22).
-///
-/// Adding 2^23 leaves the rounded number in the low bits of the mantissa, which is much faster than a checked cast; the
-/// further 2 keep 0 - 0.5 above 2^23. Where the number is whole, the result may be one less with a rest of 1.
-#[inline(always)]
-fn split(x: f32) -> (usize, f32) {
-    const MAGIC: f32 = 8_388_610.0;
-    let moved = (x - 0.5) + MAGIC;
-    let whole = (moved.to_bits() & 0x007f_ffff) as usize - 2;
-    (whole, x - (moved - MAGIC))
 }
 
 fn mean4(a: u32, b: u32, c: u32, d: u32) -> u32 {

@@ -1,15 +1,12 @@
 //! Everything there is to see on a track, prepared once so that a picture needs only look-ups.
 
-use crate::simulator::math::{Rng, Vec3, lerp, sin_cos, smoothstep, vec3};
+use crate::simulator::math::{Rng, Vec3, lerp, sin_cos, smoothstep, value_noise, vec3};
+use crate::simulator::road::line::{Road, Station, WALL_GAP_M};
 use crate::simulator::road::spec::{Plant, Wall};
-use crate::simulator::road::track::Track;
 use crate::simulator::scenery::pictures::Picture;
 use crate::simulator::scenery::road_texture::{HALF_ROAD_M, PERIOD_M, RoadTexture};
 use crate::simulator::scenery::sky::Sky;
-use crate::simulator::scenery::terrain::{GroundMap, NO_STATION, Terrain, told};
-
-/// Distance from the edge of the road to the face of a wall, m.
-pub const WALL_GAP_M: f64 = 0.7;
+use crate::simulator::scenery::terrain::{GroundMap, NO_STATION, Terrain};
 
 /// A station in the form the renderer needs.
 #[derive(Clone, Copy)]
@@ -88,9 +85,9 @@ pub struct World {
 
 impl World {
     /// Prepares the world of a track.
-    pub fn build(track: &Track) -> World {
-        let (land, light) = (&track.spec.land, &track.spec.light);
-        let terrain = Terrain::build(track);
+    pub fn build(road: &Road) -> World {
+        let (land, light) = (&road.spec.land, &road.spec.light);
+        let terrain = Terrain::build(road);
         let sun = {
             let (sin_a, cos_a) = sin_cos(light.sun_azimuth_deg.to_radians());
             let (sin_e, cos_e) = sin_cos(light.sun_elevation_deg.clamp(5.0, 85.0).to_radians());
@@ -98,19 +95,19 @@ impl World {
         };
         let sunlight = light.sun.map(|c| f32::from(c) / 255.0);
         let lit = terrain.lit(sun, light.shade);
-        let mut scenery = Scenery::new(track, &terrain, &lit);
+        let mut scenery = Scenery::new(road, &terrain, &lit);
         scenery.plant();
         scenery.post();
-        let walls = walls(track, &terrain, &lit);
-        let shadow = shadows(track, &terrain, &scenery.sprites, &scenery.kinds, sun);
-        let ground = GroundMap::build(track, &terrain, &lit, &shadow);
-        let periods = (track.length_m / f64::from(PERIOD_M)).round().max(1.0) as f32;
+        let walls = walls(road, &terrain, &lit);
+        let shadow = shadows(road, &terrain, &scenery.sprites, &scenery.kinds, sun);
+        let ground = GroundMap::build(road, &terrain, &lit, &shadow);
+        let periods = (road.length_m / f64::from(PERIOD_M)).round().max(1.0) as f32;
         let road_length_m = periods * PERIOD_M;
         World {
             ground,
-            road: road_cells(track, &terrain, road_length_m),
+            road: road_cells(road, &terrain, road_length_m),
             road_length_m,
-            textures: track
+            textures: road
                 .spec
                 .look
                 .iter()
@@ -120,7 +117,7 @@ impl World {
             sprites: scenery.sprites,
             pictures: scenery.pictures,
             walls,
-            sky: Sky::paint(track),
+            sky: Sky::paint(road),
             haze: light.horizon.map(f32::from),
             haze_m: light.haze_m,
             terrain,
@@ -128,11 +125,11 @@ impl World {
     }
 }
 
-fn road_cells(track: &Track, terrain: &Terrain, road_length_m: f32) -> Vec<RoadCell> {
-    let n = track.stations.len() as f32;
-    let cell = |(i, s): (usize, &crate::simulator::road::track::Station)| {
-        let name = told(track, track.s_of(i), |s| s.look.clone());
-        let look = name.and_then(|n| track.spec.look.iter().position(|l| l.name == n)).unwrap_or(0);
+fn road_cells(road: &Road, terrain: &Terrain, road_length_m: f32) -> Vec<RoadCell> {
+    let n = road.stations.len() as f32;
+    let cell = |(i, s): (usize, &Station)| {
+        let name = road.spec.setting_at(road.s_of(i), |s| s.look.clone());
+        let look = name.and_then(|n| road.spec.look.iter().position(|l| l.name == n)).unwrap_or(0);
         RoadCell {
             gx: s.x as f32 - terrain.x0,
             gy: s.y as f32 - terrain.y0,
@@ -144,7 +141,7 @@ fn road_cells(track: &Track, terrain: &Terrain, road_length_m: f32) -> Vec<RoadC
             look: look as u32,
         }
     };
-    track.stations.iter().enumerate().map(cell).collect()
+    road.stations.iter().enumerate().map(cell).collect()
 }
 
 /// Light at a point, from the lit grid.
@@ -154,16 +151,16 @@ fn light_at(terrain: &Terrain, lit: &[(f32, f32)], x: f32, y: f32) -> f32 {
     lit[j * terrain.nx + i].0
 }
 
-fn walls(track: &Track, terrain: &Terrain, lit: &[(f32, f32)]) -> Vec<WallPiece> {
+fn walls(road: &Road, terrain: &Terrain, lit: &[(f32, f32)]) -> Vec<WallPiece> {
     const STEP: usize = 3;
-    let n = track.stations.len();
+    let n = road.stations.len();
     let mut pieces = Vec::new();
     for (side, sign) in [(0, -1.0), (1, 1.0)] {
         for i in (0..n).step_by(STEP) {
-            let s_m = track.s_of(i);
-            let Some(wall) = wall_at(track, s_m, side == 1) else { continue };
+            let s_m = road.s_of(i);
+            let Some(wall) = road.wall_at(s_m, side == 1) else { continue };
             let foot = |k: usize| {
-                let s = &track.stations[k % n];
+                let s = &road.stations[k % n];
                 let d = sign * (s.width_m / 2.0 + WALL_GAP_M);
                 vec3((s.x + s.ty * d) as f32, (s.y - s.tx * d) as f32, (s.z - s.crossfall * d) as f32)
             };
@@ -175,16 +172,11 @@ fn walls(track: &Track, terrain: &Terrain, lit: &[(f32, f32)]) -> Vec<WallPiece>
     pieces
 }
 
-/// The wall beside the road at `s_m`, on the right or on the left.
-pub fn wall_at(track: &Track, s_m: f64, right: bool) -> Option<Wall> {
-    told(track, s_m, |s| if right { s.right_wall } else { s.left_wall })
-}
-
 /// Pictures of each kind of plant, so that neighbours differ.
 const VARIANTS: usize = 3;
 
 struct Scenery<'a> {
-    track: &'a Track,
+    road: &'a Road,
     terrain: &'a Terrain,
     lit: &'a [(f32, f32)],
     pictures: Vec<Picture>,
@@ -193,8 +185,8 @@ struct Scenery<'a> {
 }
 
 impl<'a> Scenery<'a> {
-    fn new(track: &'a Track, terrain: &'a Terrain, lit: &'a [(f32, f32)]) -> Self {
-        Scenery { track, terrain, lit, pictures: Vec::new(), kinds: Vec::new(), sprites: Vec::new() }
+    fn new(road: &'a Road, terrain: &'a Terrain, lit: &'a [(f32, f32)]) -> Self {
+        Scenery { road, terrain, lit, pictures: Vec::new(), kinds: Vec::new(), sprites: Vec::new() }
     }
 
     /// Index of the first of the pictures of `plant`.
@@ -203,7 +195,7 @@ impl<'a> Scenery<'a> {
             return at;
         }
         for variant in 0..VARIANTS as u32 {
-            self.pictures.push(Picture::paint(plant, self.track.spec.land.seed + 100 * variant));
+            self.pictures.push(Picture::paint(plant, self.road.spec.land.seed + 100 * variant));
             self.kinds.push(plant);
         }
         self.pictures.len() - VARIANTS
@@ -213,7 +205,7 @@ impl<'a> Scenery<'a> {
     fn distance_from_edge(&self, x: f32, y: f32) -> Option<f32> {
         let station = self.terrain.station_at_grid(x - self.terrain.x0, y - self.terrain.y0);
         (station != NO_STATION).then(|| {
-            let s = &self.track.stations[usize::from(station)];
+            let s = &self.road.stations[usize::from(station)];
             let (dx, dy) = (x - s.x as f32, y - s.y as f32);
             (dx * dx + dy * dy).sqrt() - s.width_m as f32 / 2.0
         })
@@ -221,7 +213,7 @@ impl<'a> Scenery<'a> {
 
     fn stand(&mut self, x: f32, y: f32, picture: usize, scale: f32, mirrored: bool) {
         let z = self.terrain.height(x, y);
-        if self.track.spec.land.water_level_m.is_some_and(|level| z < level + 0.3) {
+        if self.road.spec.land.water_level_m.is_some_and(|level| z < level + 0.3) {
             return;
         }
         let light = 0.35 + 0.65 * light_at(self.terrain, self.lit, x, y).min(1.1);
@@ -229,16 +221,16 @@ impl<'a> Scenery<'a> {
     }
 
     fn plant(&mut self) {
-        let land = &self.track.spec.land;
+        let land = &self.road.spec.land;
         if land.plants.is_empty() {
             return;
         }
         let mut rng = Rng::new(u64::from(land.seed), "plants");
-        let near = (self.track.length_m / 100.0 * f64::from(land.plants_per_100_m) * 2.0) as usize;
+        let near = (self.road.length_m / 100.0 * f64::from(land.plants_per_100_m) * 2.0) as usize;
         for k in 0..near * 2 {
             // The first half stands along the road, the second half anywhere on the land.
             let (x, y) = if k < near {
-                let s = self.track.at(rng.between(0.0, self.track.length_m));
+                let s = self.road.at(rng.between(0.0, self.road.length_m));
                 let u = rng.unit();
                 let d = s.width_m / 2.0 + f64::from(land.plants_from_m) + u * u * 38.0;
                 let d = if rng.unit() < 0.5 { -d } else { d };
@@ -263,13 +255,13 @@ impl<'a> Scenery<'a> {
 
     /// Posts on the outside of bends.
     fn post(&mut self) {
-        let Some(plant) = self.track.spec.land.posts else { return };
+        let Some(plant) = self.road.spec.land.posts else { return };
         let picture = self.pictures_of(plant);
-        for i in (0..self.track.stations.len()).step_by(9) {
-            let s = self.track.stations[i];
+        for i in (0..self.road.stations.len()).step_by(9) {
+            let s = self.road.stations[i];
             if s.curvature.abs() > 1.0 / 70.0 {
                 let d = (s.width_m / 2.0 + 1.6) * -s.curvature.signum();
-                if wall_at(self.track, self.track.s_of(i), d > 0.0).is_none() {
+                if self.road.wall_at(self.road.s_of(i), d > 0.0).is_none() {
                     self.stand((s.x + s.ty * d) as f32, (s.y - s.tx * d) as f32, picture, 1.0, false);
                 }
             }
@@ -278,11 +270,11 @@ impl<'a> Scenery<'a> {
 }
 
 /// The part of sunlight, 0 to 255, that trees let through at each texel (0.5 m) of the ground map.
-fn shadows(track: &Track, terrain: &Terrain, sprites: &[Sprite], kinds: &[Plant], sun: Vec3) -> Vec<u8> {
+fn shadows(road: &Road, terrain: &Terrain, sprites: &[Sprite], kinds: &[Plant], sun: Vec3) -> Vec<u8> {
     let (nx, ny) = (terrain.nx * 2, terrain.ny * 2);
     let mut map = vec![255u8; nx * ny];
     let run = 1.0 / sun.z.max(0.1);
-    let seed = track.spec.land.seed;
+    let seed = road.spec.land.seed;
     for sprite in sprites {
         // Height of the crown's middle, its radius, half its height, and how dense it is.
         let (height, radius, half, dense) = match kinds[sprite.picture] {
@@ -310,7 +302,7 @@ fn shadows(track: &Track, terrain: &Terrain, sprites: &[Sprite], kinds: &[Plant]
             for i in (ci - reach).max(0)..(ci + reach).min(nx as i32) {
                 let (dx, dy) = (i as f32 * 0.5 + terrain.x0 - cx, j as f32 * 0.5 + terrain.y0 - cy);
                 let (a, b) = ((dx * ux + dy * uy) / long, (dx * uy - dy * ux) / radius);
-                let leaves = crate::simulator::math::value_noise(i as f32 / 2.2, j as f32 / 2.2, None, seed + 40) - 0.5;
+                let leaves = value_noise(i as f32 / 2.2, j as f32 / 2.2, None, seed + 40) - 0.5;
                 let inside = smoothstep(1.25, 0.7, a * a + b * b + leaves * 1.2);
                 let texel = &mut map[j as usize * nx + i as usize];
                 *texel = (f32::from(*texel) * lerp(1.0, 1.0 - dense, inside)) as u8;

@@ -6,8 +6,8 @@ use crate::simulator::car::dynamics::{Controls, MAX_STEER_DEG, STEP_S, STEPS_PER
 use crate::simulator::car::noise::SteeringNoise;
 use crate::simulator::car::simulation::{Simulation, Start};
 use crate::simulator::car::speed::telemetry_mph;
-use crate::simulator::road::track::Track;
-use crate::simulator::trial::run::{DRIVE_HZ, Failure, INTERVENTION_M, Moment, Run, RunOptions};
+use crate::simulator::track::Track;
+use crate::simulator::trial::outcome::{DRIVE_HZ, Failure, INTERVENTION_M, Moment, Trial, TrialOptions};
 
 /// Longest time with more than two wheels off the road, s.
 const OFF_ROAD_LIMIT_S: f64 = 1.0;
@@ -17,7 +17,7 @@ const STANDING_LIMIT_S: f64 = 10.0;
 /// A car on its way: frames fall due at 20 Hz, answers go to the wheels, steps move the car, and the run is judged.
 pub struct ClosedLoop<'a> {
     simulation: Simulation<'a>,
-    options: RunOptions,
+    options: TrialOptions,
     noise: SteeringNoise,
     /// Steering on its way to the wheels: the step at which it arrives, and its value.
     pending: VecDeque<(u64, f64)>,
@@ -33,12 +33,12 @@ pub struct ClosedLoop<'a> {
     off_steps: u64,
     standing_steps: u64,
     put_back: bool,
-    run: Run,
+    run: Trial,
 }
 
 impl<'a> ClosedLoop<'a> {
     /// A run whose start and noise `seed` draws.
-    pub fn new(track: &'a Track, options: &RunOptions, seed: u64) -> ClosedLoop<'a> {
+    pub fn new(track: &'a Track, options: &TrialOptions, seed: u64) -> ClosedLoop<'a> {
         let simulation = Simulation::new(track, Start::draw(track, seed), options.speed.at_start_mps());
         let way_m = options.laps as f64 * track.length_m;
         let slowest_mps = 0.25 * options.speed.at_start_mps().max(2.0);
@@ -56,7 +56,7 @@ impl<'a> ClosedLoop<'a> {
             off_steps: 0,
             standing_steps: 0,
             put_back: false,
-            run: Run { worst_cte_m: simulation.cte_m().abs(), ..Run::default() },
+            run: Trial { worst_cte_m: simulation.cte_m().abs(), ..Trial::default() },
             simulation,
         }
     }
@@ -168,7 +168,7 @@ impl<'a> ClosedLoop<'a> {
     }
 
     /// What the run came to.
-    pub fn finish(mut self) -> Run {
+    pub fn finish(mut self) -> Trial {
         self.run.time_s = self.simulation.time_s();
         self.run.distance_m = self.simulation.progress_m.max(0.0);
         let laps = (self.run.distance_m / self.simulation.track.length_m + 1e-9) as usize;

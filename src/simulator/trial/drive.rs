@@ -3,117 +3,17 @@
 use std::time::Instant;
 
 use rayon::prelude::*;
-use serde::{Deserialize, Serialize};
 
-use crate::files::new_folder::NewFolder;
 use crate::observer::{Observer, Progress, Tally};
 use crate::simulator::car::speed::Speed;
-use crate::simulator::road::track::Track;
-use crate::simulator::trial::observer::DriveEvent;
-use crate::simulator::trial::run::{Driver, Expert, INTERVENTION_M, Run, RunOptions, line_errors_m, run, run_observed};
+use crate::simulator::track::Track;
+use crate::simulator::trial::driver::{Driver, Expert};
+use crate::simulator::trial::event::DriveEvent;
+use crate::simulator::trial::outcome::{Failure, INTERVENTION_M, INTERVENTION_S, Trial, line_errors_m};
+use crate::simulator::trial::run::{run_trial, run_trial_observed};
 use crate::simulator::trial::statistics::{PairedTest, wilson_interval};
-use crate::simulator::trial::trajectory::{SUMMARY, trajectory_csv};
+use crate::simulator::trial::summary::{DriveOptions, DriveResult, DriveSummary, TrialPair};
 use crate::{Error, Result};
-
-/// How a driver is put to the test.
-#[derive(Clone, Debug)]
-pub struct DriveOptions {
-    /// Laps of each run.
-    pub laps: usize,
-    /// Runs; run `k` has seed `seed + k`.
-    pub runs: usize,
-    /// First seed.
-    pub seed: u64,
-    /// Speed to hold.
-    pub speed: Speed,
-    /// Time from a picture to the wheels, ms.
-    pub latency_ms: f64,
-    /// Standard deviation of a disturbance of the steering.
-    pub noise: f64,
-}
-
-impl Default for DriveOptions {
-    fn default() -> Self {
-        DriveOptions { laps: 1, runs: 10, seed: 1, speed: Speed::Fixed(20.0), latency_ms: 0.0, noise: 0.0 }
-    }
-}
-
-impl DriveOptions {
-    /// How a run of the drive is driven, free or assisted.
-    pub fn of_run(&self, assisted: bool) -> RunOptions {
-        let DriveOptions { laps, speed, latency_ms, noise, .. } = *self;
-        RunOptions { laps, speed, latency_ms, noise, assisted }
-    }
-}
-
-/// A seed driven twice.
-#[derive(Clone, Debug, PartialEq)]
-pub struct RunPair {
-    /// The seed.
-    pub seed: u64,
-    /// Nobody helps.
-    pub free: Run,
-    /// The car is put back when it is too far from the line.
-    pub assisted: Run,
-}
-
-/// The measures of a drive; the fields of `drive --json`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct DriveSummary {
-    /// Track as given on the command line.
-    pub track: String,
-    /// Whether training must not see the track.
-    pub held_out: bool,
-    /// Held-out tracks that the driver was trained on all the same; whoever knows the driver sets it.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub trained_on_held_out: Vec<String>,
-    /// Seeds driven.
-    pub runs: usize,
-    /// Laps completed without help.
-    pub laps_completed: usize,
-    /// Laps asked for.
-    pub laps_total: usize,
-    /// Runs with all laps completed: 95 % interval (Wilson) of their share.
-    pub completed_low: f64,
-    /// See `completed_low`.
-    pub completed_high: f64,
-    /// Share of the assisted time in which nobody had to help, %.
-    pub autonomy_percent: f64,
-    /// Times the car was put back in assisted runs.
-    pub interventions: usize,
-    /// The same for each km.
-    pub interventions_per_km: f64,
-    /// Way of the free runs, m.
-    pub distance_m: f64,
-    /// Distance from the line in free runs: mean, m.
-    pub cte_mean_m: f64,
-    /// Its root mean square, m.
-    pub cte_rms_m: f64,
-    /// Its 95th percentile, m.
-    pub cte_p95_m: f64,
-    /// Time with more than two wheels off the road in free runs, s.
-    pub off_road_s: f64,
-    /// Free runs that hit a wall.
-    pub crashes: usize,
-    /// Mean speed of the free runs, mph.
-    pub mean_speed_mph: f64,
-    /// Root mean square rate of the steering, deg/s, over the free runs: what the wheel trembles.
-    pub whiteness_deg_s: f64,
-    /// The same for the expert with the same seeds.
-    pub expert_whiteness_deg_s: f64,
-    /// Simulated seconds for each second in which a thread drives (the expert's runs left out), times the threads that its
-    /// runs can keep at work; the one number that differs between runs.
-    pub realtime_factor: f64,
-}
-
-/// A drive: every run and their summary.
-#[derive(Clone, Debug, PartialEq)]
-pub struct DriveResult {
-    /// Runs in the order of their seeds.
-    pub runs: Vec<RunPair>,
-    /// Measures over all runs.
-    pub summary: DriveSummary,
-}
 
 /// Drives every seed of `options` twice, free and assisted, runs in parallel; results do not depend on the number of
 /// threads. `new_driver` makes a fresh driver for a run.
@@ -164,8 +64,8 @@ where
 
 /// What is measured of one seed.
 struct Measured {
-    pair: RunPair,
-    expert: Run,
+    pair: TrialPair,
+    expert: Trial,
     simulated_s: f64,
     busy_s: f64,
 }
@@ -185,8 +85,10 @@ where
     let mut go = |assisted| {
         let mut driver = new_driver()?;
         match &mut observer {
-            Some(observer) => run_observed(track, driver.as_mut(), &options.of_run(assisted), seed, &mut **observer),
-            None => run(track, driver.as_mut(), &options.of_run(assisted), seed),
+            Some(observer) => {
+                run_trial_observed(track, driver.as_mut(), &options.trial_options(assisted), seed, &mut **observer)
+            }
+            None => run_trial(track, driver.as_mut(), &options.trial_options(assisted), seed),
         }
     };
     let began = Instant::now();
@@ -201,8 +103,8 @@ where
         assisted
     };
     let busy_s = began.elapsed().as_secs_f64();
-    let expert = run(track, &mut Expert, &options.of_run(false), seed)?;
-    Ok(Measured { pair: RunPair { seed, free, assisted }, expert, simulated_s, busy_s })
+    let expert = run_trial(track, &mut Expert, &options.trial_options(false), seed)?;
+    Ok(Measured { pair: TrialPair { seed, free, assisted }, expert, simulated_s, busy_s })
 }
 
 /// The result of all seeds, driven by `threads` threads.
@@ -211,13 +113,13 @@ fn put_together(track: &Track, options: &DriveOptions, measured: Vec<Measured>, 
     let (simulated_s, busy_s) = (sum(|m| m.simulated_s), sum(|m| m.busy_s));
     let (expert_sum, expert_s) = (sum(|m| m.expert.whiteness_sum), sum(|m| m.expert.time_s));
     let realtime_factor = simulated_s / busy_s.max(1e-9) * threads.min(options.runs) as f64;
-    let runs: Vec<RunPair> = measured.into_iter().map(|m| m.pair).collect();
+    let runs: Vec<TrialPair> = measured.into_iter().map(|m| m.pair).collect();
     let summary = DriveSummary {
         expert_whiteness_deg_s: (expert_sum / expert_s.max(1e-9)).sqrt(),
         realtime_factor,
         ..summarise(track, options, &runs)
     };
-    DriveResult { runs, summary }
+    DriveResult { trials: runs, summary }
 }
 
 fn check(options: &DriveOptions) -> Result<()> {
@@ -239,8 +141,8 @@ fn check(options: &DriveOptions) -> Result<()> {
     Ok(())
 }
 
-fn summarise(track: &Track, options: &DriveOptions, runs: &[RunPair]) -> DriveSummary {
-    let sum = |f: &dyn Fn(&RunPair) -> f64| runs.iter().map(f).sum::<f64>();
+fn summarise(track: &Track, options: &DriveOptions, runs: &[TrialPair]) -> DriveSummary {
+    let sum = |f: &dyn Fn(&TrialPair) -> f64| runs.iter().map(f).sum::<f64>();
     let free = || runs.iter().flat_map(|r| &r.free.moments);
     let [cte_mean_m, cte_rms_m, cte_p95_m] = line_errors_m(free());
     let time_s = sum(&|r| r.free.time_s).max(1e-9);
@@ -248,7 +150,7 @@ fn summarise(track: &Track, options: &DriveOptions, runs: &[RunPair]) -> DriveSu
     let interventions: usize = runs.iter().map(|r| r.assisted.interventions).sum();
     let whole = runs.iter().filter(|r| r.free.laps_completed == options.laps).count();
     let (completed_low, completed_high) = wilson_interval(whole, runs.len());
-    let charged = crate::simulator::trial::run::INTERVENTION_S * interventions as f64;
+    let charged = INTERVENTION_S * interventions as f64;
     DriveSummary {
         track: track.name().to_string(),
         held_out: track.held_out(),
@@ -266,7 +168,7 @@ fn summarise(track: &Track, options: &DriveOptions, runs: &[RunPair]) -> DriveSu
         cte_rms_m,
         cte_p95_m,
         off_road_s: sum(&|r| r.free.off_road_s),
-        crashes: runs.iter().filter(|r| r.free.failure == Some(crate::simulator::trial::run::Failure::Crash)).count(),
+        crashes: runs.iter().filter(|r| r.free.failure == Some(Failure::Crash)).count(),
         mean_speed_mph: free().map(|m| m.speed_mph).sum::<f64>() / free().count().max(1) as f64,
         whiteness_deg_s: (sum(&|r| r.free.whiteness_sum) / time_s).sqrt(),
         expert_whiteness_deg_s: 0.0,
@@ -279,15 +181,15 @@ fn summarise(track: &Track, options: &DriveOptions, runs: &[RunPair]) -> DriveSu
 /// # Errors
 /// If the drives are of different tracks or seeds.
 pub fn compare(a: &DriveResult, b: &DriveResult) -> Result<Vec<PairedTest>> {
-    let seeds = |d: &DriveResult| d.runs.iter().map(|r| r.seed).collect::<Vec<_>>();
+    let seeds = |d: &DriveResult| d.trials.iter().map(|r| r.seed).collect::<Vec<_>>();
     if a.summary.track != b.summary.track || seeds(a) != seeds(b) {
         return Err(Error::Input("only drives of one track with the same seeds can be compared".to_string()));
     }
-    let test = |measure: &str, f: &dyn Fn(&RunPair) -> f64| {
-        let values = |d: &DriveResult| d.runs.iter().map(f).collect::<Vec<_>>();
+    let test = |measure: &str, f: &dyn Fn(&TrialPair) -> f64| {
+        let values = |d: &DriveResult| d.trials.iter().map(f).collect::<Vec<_>>();
         PairedTest::new(measure, &values(a), &values(b))
     };
-    let mean_cte = |r: &RunPair| {
+    let mean_cte = |r: &TrialPair| {
         let moments = &r.assisted.moments;
         moments.iter().map(|m| m.cte_m.abs()).sum::<f64>() / moments.len().max(1) as f64
     };
@@ -298,30 +200,11 @@ pub fn compare(a: &DriveResult, b: &DriveResult) -> Result<Vec<PairedTest>> {
     ])
 }
 
-/// Writes the runs as `free_SEED.csv` and `assisted_SEED.csv`, and their summary as `summary.json`, into `folder`, and
-/// gives it its name.
-///
-/// # Errors
-/// If it cannot be written.
-pub fn write_trajectories(result: &DriveResult, folder: NewFolder) -> Result<()> {
-    for pair in &result.runs {
-        for (kind, run) in [("free", &pair.free), ("assisted", &pair.assisted)] {
-            let path = folder.unfinished().join(format!("{kind}_{}.csv", pair.seed));
-            let written = std::fs::write(&path, trajectory_csv(run));
-            written.map_err(|source| folder.explain(Error::Io { path, source }))?;
-        }
-    }
-    let path = folder.unfinished().join(SUMMARY);
-    let text = serde_json::to_string_pretty(&result.summary).map_err(|e| Error::data(&path, e.to_string()))?;
-    std::fs::write(&path, text + "\n").map_err(|source| folder.explain(Error::Io { path, source }))?;
-    folder.finish()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::observer::Unobserved;
-    use crate::simulator::trial::run::Zero;
+    use crate::simulator::trial::driver::Zero;
 
     fn go(track: &str, expert: bool, runs: usize) -> DriveResult {
         let track = Track::load(track).unwrap();
@@ -350,7 +233,7 @@ mod tests {
     fn threads_do_not_change_results() {
         let with = |threads| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            pool.install(|| go("mountain", true, 4).runs)
+            pool.install(|| go("mountain", true, 4).trials)
         };
         assert_eq!(with(1), with(3));
     }
@@ -373,13 +256,13 @@ mod tests {
         let mut watching = Watching(Vec::new(), 0);
         let watched = drive_observed(&track, make, &options, &mut watching).unwrap();
         let unseen = drive(&track, make, &options, &mut Unobserved).unwrap();
-        assert_eq!(watched.runs, unseen.runs);
+        assert_eq!(watched.trials, unseen.trials);
         let summary = DriveSummary { realtime_factor: unseen.summary.realtime_factor, ..watched.summary };
         assert_eq!(summary, unseen.summary);
         assert_eq!(watching.0, [(3, false), (3, true), (4, false), (4, true)]);
         assert_eq!(
             watching.1,
-            unseen.runs.iter().map(|r| r.free.moments.len() + r.assisted.moments.len()).sum::<usize>()
+            unseen.trials.iter().map(|r| r.free.moments.len() + r.assisted.moments.len()).sum::<usize>()
         );
     }
 

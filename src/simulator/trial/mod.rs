@@ -1,8 +1,11 @@
-//! A measured drive: one run, several runs, their statistics and their trajectories.
+//! A measured drive: one trial, many trials, their statistics and their trajectories.
 
 pub mod closed_loop;
 pub mod drive;
-pub mod observer;
+pub mod driver;
+pub mod event;
+pub mod outcome;
 pub mod run;
 pub mod statistics;
+pub mod summary;
 pub mod trajectory;

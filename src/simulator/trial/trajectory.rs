@@ -5,8 +5,9 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
-use crate::simulator::trial::drive::DriveSummary;
-use crate::simulator::trial::run::Run;
+use crate::files::new_folder::NewFolder;
+use crate::simulator::trial::outcome::Trial;
+use crate::simulator::trial::summary::{DriveResult, DriveSummary};
 use crate::{Error, Result};
 
 /// How deep drives lie below the folder of a training run: `drives/NAME`.
@@ -16,7 +17,7 @@ pub const RUN_DEPTH: usize = 2;
 pub(crate) const SUMMARY: &str = "summary.json";
 
 /// A run as CSV text, one line for each frame.
-pub fn trajectory_csv(run: &Run) -> String {
+pub fn trajectory_csv(run: &Trial) -> String {
     let mut text = String::from("time_s,x_m,y_m,s_m,cte_m,steering,throttle,speed_mph,intervention,heading_deg\n");
     for m in &run.moments {
         // Writing to a string cannot fail.
@@ -114,4 +115,23 @@ pub fn read_trajectory(path: &Path) -> Result<Vec<Waypoint>> {
         way.push(waypoint.map_err(|e: csv::Error| Error::data_at(path, line, e.to_string()))?);
     }
     Ok(way)
+}
+
+/// Writes the runs as `free_SEED.csv` and `assisted_SEED.csv`, and their summary as `summary.json`, into `folder`, and
+/// gives it its name.
+///
+/// # Errors
+/// If it cannot be written.
+pub fn write_trajectories(result: &DriveResult, folder: NewFolder) -> Result<()> {
+    for pair in &result.trials {
+        for (kind, run) in [("free", &pair.free), ("assisted", &pair.assisted)] {
+            let path = folder.unfinished().join(format!("{kind}_{}.csv", pair.seed));
+            let written = std::fs::write(&path, trajectory_csv(run));
+            written.map_err(|source| folder.explain(Error::Io { path, source }))?;
+        }
+    }
+    let path = folder.unfinished().join(SUMMARY);
+    let text = serde_json::to_string_pretty(&result.summary).map_err(|e| Error::data(&path, e.to_string()))?;
+    std::fs::write(&path, text + "\n").map_err(|source| folder.explain(Error::Io { path, source }))?;
+    folder.finish()
 }

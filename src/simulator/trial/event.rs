@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use crate::simulator::camera::pinhole::RgbFrame;
 use crate::simulator::car::simulation::Simulation;
-use crate::simulator::trial::run::RunOptions;
+use crate::simulator::trial::outcome::TrialOptions;
 
 /// What there is to see at one frame of a run, after the driver has answered it and before the car moves on.
 pub struct DriveFrame<'a> {
@@ -13,7 +13,7 @@ pub struct DriveFrame<'a> {
     /// The car on its track: place, direction, cross-track error, wheels off the road, time.
     pub simulation: &'a Simulation<'a>,
     /// How the run is driven.
-    pub options: &'a RunOptions,
+    pub options: &'a TrialOptions,
     /// The driver's steering, [-1, 1], + = right.
     pub steering: f64,
     /// What the expert would steer here, [-1, 1], + = right.
@@ -46,7 +46,7 @@ pub enum DriveEvent<'a> {
         /// What draws its start, light and noise.
         seed: u64,
         /// How it is driven.
-        options: &'a RunOptions,
+        options: &'a TrialOptions,
     },
     /// The driver has answered a frame.
     Frame(&'a DriveFrame<'a>),

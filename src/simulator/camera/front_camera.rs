@@ -2,14 +2,15 @@
 
 use crate::Result;
 use crate::simulator::camera::jpeg;
-use crate::simulator::camera::pinhole::{BodyPose, Camera, Mount, RgbFrame};
+use crate::simulator::camera::pinhole::{Camera, Mount, RgbFrame};
 use crate::simulator::camera::renderer::Renderer;
+use crate::simulator::car::pose::BodyPose;
 use crate::simulator::car::simulation::Simulation;
-use crate::simulator::road::track::Track;
 use crate::simulator::scenery::light::Variant;
+use crate::simulator::track::Track;
 
 /// Takes the pictures that a driver sees. Keeps its buffers.
-pub struct Eye<'a> {
+pub struct FrontCamera<'a> {
     track: &'a Track,
     variant: Variant,
     renderer: Renderer,
@@ -17,10 +18,10 @@ pub struct Eye<'a> {
     bytes: Vec<u8>,
 }
 
-impl<'a> Eye<'a> {
+impl<'a> FrontCamera<'a> {
     /// The camera of the run `seed`.
-    pub fn new(track: &'a Track, seed: u64) -> Eye<'a> {
-        Eye {
+    pub fn new(track: &'a Track, seed: u64) -> FrontCamera<'a> {
+        FrontCamera {
             track,
             variant: Variant::new(track.world(), seed),
             renderer: Renderer::default(),
@@ -56,7 +57,7 @@ impl<'a> Eye<'a> {
     /// The same for a car whose body is at `body`.
     ///
     /// # Errors
-    /// As [`look`](Eye::look).
+    /// As [`look`](FrontCamera::look).
     pub fn look_from(&mut self, body: &BodyPose) -> Result<&RgbFrame> {
         self.take(body)?;
         jpeg::decode(&self.bytes, &mut self.frame)?;

@@ -4,19 +4,13 @@
 //! curvature, slope, banking and width. A point of the world is located by its distance `s_m` along the line and its
 //! offset `offset_m` from it (+ = right of the line, looking along it).
 
-use std::path::Path;
-use std::sync::OnceLock;
-
-use crate::simulator::road::builtin;
-use crate::simulator::road::random_track;
+use crate::simulator::math::{sin_cos, tan};
 use crate::simulator::road::spec::TrackSpec;
-use crate::simulator::scenery::world::World;
+use crate::simulator::road::spec::Wall;
 use crate::{Error, Result};
 
-/// Random tracks with this seed or a higher one are kept out of training.
-pub const FIRST_HELD_OUT_SEED: u64 = 1_000_000;
-/// What the names of random tracks begin with.
-const RANDOM: &str = "random:";
+/// Distance from the edge of the road to the face of a wall, m.
+pub const WALL_GAP_M: f64 = 0.7;
 
 /// One point of the reference line.
 #[derive(Clone, Copy, Debug)]
@@ -56,72 +50,36 @@ pub struct Location {
     pub ty: f64,
 }
 
-/// A track ready to drive on. Its visible world is built when the first picture is taken.
-pub struct Track {
+/// A road that has passed its checks: all that is known of a track before anything is drawn.
+pub struct Road {
     /// What the track file says.
     pub spec: TrackSpec,
     /// The reference line.
     pub stations: Vec<Station>,
     /// Length of a lap, m.
     pub length_m: f64,
-    world: OnceLock<World>,
 }
 
-impl Track {
-    /// Finds a track: a built-in name (`lake`), `random:SEED`, or the path of a track file ending in `.toml`.
+impl Road {
+    /// Reads a road from the text of a track file; `place` names the file in errors.
     ///
     /// # Errors
-    /// An unknown name, naming the nearest known one; an unreadable file; a track that fails the checks of
-    /// [`from_spec`](Track::from_spec).
-    pub fn load(name: &str) -> Result<Track> {
-        if let Some(seed) = name.strip_prefix(RANDOM) {
-            let seed = seed.parse().map_err(|_| {
-                Error::Usage(format!("track `{name}`: `{seed}` is no seed; write for example random:7"))
-            })?;
-            return random_track::generate(seed);
-        }
-        if let Some(text) = builtin::text(name) {
-            return Track::from_toml(text, &format!("data/tracks/{name}.toml"));
-        }
-        if name.ends_with(".toml") {
-            let text = std::fs::read_to_string(name).map_err(Error::io(Path::new(name)))?;
-            let mut track = Track::from_toml(&text, name)?;
-            // Reports tell tracks by their names, so a file must not pass for a track that comes with the program.
-            let own = &track.spec.name;
-            if builtin::text(own).is_some() || own.starts_with(RANDOM) {
-                track.spec.name = format!("{own} ({name})");
-            }
-            return Ok(track);
-        }
-        let known = builtin::names().collect::<Vec<_>>();
-        let nearest =
-            known.iter().max_by(|a, b| strsim::jaro_winkler(name, a).total_cmp(&strsim::jaro_winkler(name, b)));
-        Err(Error::Usage(format!(
-            "unknown track `{name}`; did you mean `{}`? Known: {}, random:SEED, or a path ending in .toml",
-            nearest.unwrap_or(&"lake"),
-            known.join(", ")
-        )))
-    }
-
-    /// Reads a track from the text of a track file; `place` names the file in errors.
-    ///
-    /// # Errors
-    /// As [`from_spec`](Track::from_spec), and anything that is no track file.
-    pub fn from_toml(text: &str, place: &str) -> Result<Track> {
+    /// As [`from_spec`](Road::from_spec), and anything that is no track file.
+    pub fn from_toml(text: &str, place: &str) -> Result<Road> {
         let spec: TrackSpec = toml::from_str(text).map_err(|e| {
             let before = e.span().and_then(|span| text.get(..span.start)).unwrap_or_default();
             Error::data_at(place, 1 + before.matches('\n').count() as u64, e.message())
         })?;
-        Track::from_spec(spec, place)
+        Road::from_spec(spec, place)
     }
 
-    /// Builds and checks a track; `place` names it in errors.
+    /// Builds and checks a road; `place` names it in errors.
     ///
     /// # Errors
     /// Fewer than 6 points, a line that is not closed, a lap outside 600-1,500 m, a bend tighter than allowed, a slope above
     /// 20 %, a width outside 5-14 m, a bank above 10 degrees, parts of the road closer together than 14 m between edges, an
     /// unknown look, a number outside its range.
-    pub fn from_spec(spec: TrackSpec, place: &str) -> Result<Track> {
+    pub fn from_spec(spec: TrackSpec, place: &str) -> Result<Road> {
         let fail = |message: String| Err(Error::Data { place: place.to_string(), message });
         if let Err(message) = spec.check() {
             return fail(message);
@@ -140,10 +98,10 @@ impl Track {
                 "land: water_level_m {level} would flood the road; at most {highest:.1}, or leave it out"
             ));
         }
-        let track = Track { spec, stations, length_m, world: OnceLock::new() };
-        track.check_stations(place)?;
-        track.check_distances(place)?;
-        Ok(track)
+        let road = Road { spec, stations, length_m };
+        road.check_stations(place)?;
+        road.check_distances(place)?;
+        Ok(road)
     }
 
     fn check_stations(&self, place: &str) -> Result<()> {
@@ -205,22 +163,6 @@ impl Track {
         Ok(())
     }
 
-    /// Whether training must not see this track.
-    pub fn held_out(&self) -> bool {
-        self.spec.held_out
-    }
-
-    /// Name in reports: of built-in and random tracks the one on the command line; of a file its `name`, followed by its path
-    /// if the name is that of a built-in or random track.
-    pub fn name(&self) -> &str {
-        &self.spec.name
-    }
-
-    /// What there is to see; built on first use.
-    pub fn world(&self) -> &World {
-        self.world.get_or_init(|| World::build(self))
-    }
-
     /// Distance between stations, m; close to 1.
     pub fn spacing_m(&self) -> f64 {
         self.length_m / self.stations.len() as f64
@@ -229,6 +171,11 @@ impl Track {
     /// Distance along the line of station `i`, m.
     pub fn s_of(&self, i: usize) -> f64 {
         i as f64 * self.spacing_m()
+    }
+
+    /// The wall beside the road at `s_m`, on the right or on the left.
+    pub fn wall_at(&self, s_m: f64, right: bool) -> Option<Wall> {
+        self.spec.setting_at(s_m, |stretch| if right { stretch.right_wall } else { stretch.left_wall })
     }
 
     /// Locates a point by searching the whole line.
@@ -273,7 +220,7 @@ impl Track {
         let s_m = (self.s_of(station) + arc).rem_euclid(self.length_m);
         // The direction turns clockwise by curvature * arc.
         let turn = (s.curvature * arc).clamp(-0.5, 0.5);
-        let (sin, cos) = crate::simulator::math::sin_cos(turn);
+        let (sin, cos) = sin_cos(turn);
         Location { station, s_m, offset_m, tx: s.tx * cos + s.ty * sin, ty: s.ty * cos - s.tx * sin }
     }
 
@@ -360,7 +307,7 @@ fn stations_of(points: &[[f64; 5]]) -> (Vec<Station>, f64) {
             ty: d[1] / speed,
             curvature: (d[1] * dd[0] - d[0] * dd[1]) / (speed * speed * speed),
             slope: d[2] / speed,
-            crossfall: crate::simulator::math::tan(p[4].clamp(-45.0, 45.0).to_radians()),
+            crossfall: tan(p[4].clamp(-45.0, 45.0).to_radians()),
             width_m: p[3],
         });
     }

@@ -1,13 +1,14 @@
-//! Leaky rectifier with trainable slopes.
+//! Leaky rectified linear unit with trainable slopes.
 
 use serde::{Deserialize, Serialize};
-use steersman_kernels::Isa;
 use steersman_kernels::activation;
+use steersman_kernels::{Backend, Isa};
 
-use super::{Grads, Layer, Pair, ParamSpec, Pass};
+use crate::engine::layers::kind::check_first_value;
+use crate::engine::layers::{ExportForm, Family, Grads, Layer, LayerKind, Pair, ParamSpec, Pass, ReceptiveField};
 use crate::engine::tensor::Shape;
 
-/// How many slopes a PReLU has.
+/// Which values of a map share a slope.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Slopes {
@@ -20,10 +21,15 @@ pub enum Slopes {
 
 /// Parametric rectified linear unit (He et al. 2015).
 ///
-/// **Forward** `y = x` for `x > 0`, else `slope · x`. **Backward** needs x: `dx = dy` for `x > 0`, else `dy · slope`;
-/// `dslope` sums `dy · x` where `x ≤ 0`. Training and evaluation are the same.
+/// - **Forward** `y = x` where `x > 0`, else `y = slope · x`.
+/// - **Backward** of `y = x`: `dx = dy`; of `y = slope · x`: `dx = dy · slope` and `dslope = Σ dy · x` over the values that share
+///   the slope. Needs x.
+/// - **Training and evaluation** are the same.
+/// - **Limits** Slopes may become negative, as in the paper. With a slope for each position, the layer takes maps of one size only.
 ///
-/// Parameters: `slope`, `[c][h][w]` or `[c]`.
+/// # Shapes
+///
+/// x, y, dx, dy: `[n][c][h][w]`. Parameters: `slope`, `[c][h][w]` or `[c]`.
 #[derive(Debug)]
 pub struct PRelu {
     shape: Shape,
@@ -89,10 +95,55 @@ impl Layer for PRelu {
     }
 }
 
+/// Options of [`PRelu`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PReluSpec {
+    /// `per_position` (default) or `per_channel`.
+    #[serde(default)]
+    pub slopes: Slopes,
+    /// Slopes before training.
+    #[serde(default)]
+    pub initial_slope: f32,
+}
+
+impl LayerKind for PReluSpec {
+    fn base_name(&self) -> &'static str {
+        "prelu"
+    }
+
+    fn describe(&self) -> String {
+        match self.slopes {
+            Slopes::PerPosition => "PReLU".into(),
+            Slopes::PerChannel => "PReLU per channel".into(),
+        }
+    }
+
+    fn family(&self) -> Family {
+        Family::Activation
+    }
+
+    fn receptive_field(&self, _input: Shape) -> ReceptiveField {
+        ReceptiveField::Element
+    }
+
+    fn check(&self, _input: Shape) -> Result<(), String> {
+        check_first_value(self.initial_slope)
+    }
+
+    fn layer(&self, input: Shape, backend: Backend) -> Result<Box<dyn Layer>, String> {
+        Ok(Box::new(PRelu::new(input, self.slopes, self.initial_slope, backend.isa)))
+    }
+
+    fn export_form(&self, _input: Shape, params: &[f32], _statistics: &[f32]) -> ExportForm {
+        ExportForm::PRelu { slopes: params.to_vec() }
+    }
+}
+
 #[cfg(test)]
 mod tests {
-    use super::super::gradcheck::check_layer;
     use super::*;
+    use crate::engine::layers::gradcheck::check_layer;
 
     #[test]
     fn gradients_hold_for_both_kinds_of_slopes() {

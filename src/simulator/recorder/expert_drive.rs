@@ -1,0 +1,211 @@
+//! The rows of a recording: the expert drives, or another driver whose rows the expert labels.
+
+use crate::Result;
+use crate::simulator::camera::front_camera::FrontCamera;
+use crate::simulator::car::dynamics::{Controls, MPS_PER_MPH, STEP_S, STEPS_PER_S};
+use crate::simulator::car::expert::{Keyboard, Style, pursuit};
+use crate::simulator::car::noise::SteeringNoise;
+use crate::simulator::car::pose::BodyPose;
+use crate::simulator::car::simulation::{Simulation, Start};
+use crate::simulator::car::speed::SpeedController;
+use crate::simulator::math::Rng;
+use crate::simulator::recorder::options::RecordOptions;
+use crate::simulator::recorder::sample::Sample;
+use crate::simulator::track::Track;
+use crate::simulator::trial::driver::{DriveState, Driver};
+use crate::simulator::trial::outcome::DRIVE_HZ;
+
+/// The expert driving for a recording.
+struct ExpertDrive<'a> {
+    simulation: Simulation<'a>,
+    speed: SpeedController,
+    keyboard: Option<Keyboard>,
+    noise: SteeringNoise,
+    target_mph: f64,
+    steps_per_row: u64,
+}
+
+impl ExpertDrive<'_> {
+    /// Drives one step; returns the label and the throttle that were in force.
+    fn step(&mut self) -> (f64, f64) {
+        let steering = match &mut self.keyboard {
+            Some(keyboard) => keyboard.steer(&self.simulation),
+            None => pursuit(&self.simulation),
+        };
+        let throttle = self.speed.throttle(self.target_mph, self.simulation.car.speed_mps / MPS_PER_MPH, STEP_S);
+        let disturbed = steering + self.noise.next(STEP_S);
+        self.simulation.step(Controls { steering: disturbed, throttle });
+        (steering, throttle)
+    }
+
+    fn sample(&self, time_s: f64, (steering, throttle): (f64, f64), body: BodyPose, speed_mps: f64) -> Sample {
+        let speed_mph = speed_mps / MPS_PER_MPH;
+        Sample { time_s, body, steering, throttle: throttle.max(0.0), brake: (-throttle).max(0.0), speed_mph }
+    }
+
+    /// Drives `steps` steps or until `done`, taking a sample whenever a row is due.
+    fn drive(&mut self, steps: u64, samples: &mut Vec<Sample>, done: impl Fn(&Simulation) -> bool) {
+        for step in 0..steps {
+            if done(&self.simulation) {
+                return;
+            }
+            let due = step % self.steps_per_row == 0;
+            let before =
+                due.then(|| (self.simulation.time_s(), self.simulation.body_pose(), self.simulation.car.speed_mps));
+            let driven = self.step();
+            if let Some((time_s, body, speed_mps)) = before {
+                samples.push(self.sample(time_s, driven, body, speed_mps));
+            }
+        }
+    }
+}
+
+/// Drives what `options` ask for and returns the rows, without pictures.
+pub fn drive_expert(track: &Track, options: &RecordOptions) -> Vec<Sample> {
+    let mut rng = Rng::new(options.seed, "recording");
+    let start = Start { reverse: options.reverse, ..Start::draw(track, options.seed) };
+    let speed_mps = options.speed_mph * MPS_PER_MPH;
+    let mut expert = ExpertDrive {
+        simulation: Simulation::new(track, start, speed_mps),
+        speed: SpeedController::default(),
+        keyboard: (options.style == Style::Keyboard).then(Keyboard::default),
+        noise: SteeringNoise::new(options.seed, options.noise),
+        target_mph: options.speed_mph,
+        steps_per_row: STEPS_PER_S / options.hz,
+    };
+    let way_m = options.laps * track.length_m;
+    let most_steps = (way_m / speed_mps.max(1.0) * 3.0) as u64 * STEPS_PER_S + 500;
+    let mut samples = Vec::new();
+    if !options.recovery {
+        expert.drive(most_steps, &mut samples, |s| s.progress_m >= way_m);
+        return samples;
+    }
+    // Every 22 m or so the car is put off its line, on alternating sides, and the way back is recorded.
+    let mut s_m = start.s_m;
+    let mut gone_m = 0.0;
+    let mut side = if rng.unit() < 0.5 { 1.0 } else { -1.0 };
+    while gone_m < way_m {
+        let room = track.at(s_m).width_m / 2.0 - 1.2;
+        let offset_m = side * rng.between(0.7, 2.2).min(room);
+        let heading_deg = rng.between(-4.0, 12.0) * side;
+        expert.simulation.put(Start { s_m, reverse: options.reverse, offset_m, heading_deg }, speed_mps);
+        expert.keyboard = expert.keyboard.map(|_| Keyboard::default());
+        expert.drive(3 * STEPS_PER_S, &mut samples, |s| s.cte_m().abs() < 0.1 && s.heading_error().abs() < 0.03);
+        // A pause in the names of the pictures, so that a reader sees where one stretch ends and the next begins.
+        expert.simulation.steps += 2 * STEPS_PER_S;
+        let step_m = rng.between(16.0, 28.0);
+        gone_m += step_m;
+        s_m += if options.reverse { -step_m } else { step_m };
+        side = -side;
+    }
+    samples
+}
+
+/// Distance from the line at which a driver who learns is put back, m: what lies beyond no longer teaches how to stay.
+const LOST_M: f64 = 2.2;
+
+/// Lets `driver` drive what `options` ask for and returns the rows, labelled with the expert's steering at every moment.
+/// In a share of the seconds, `expert_share`, the expert itself is at the wheel.
+///
+/// # Errors
+/// If a picture cannot be encoded.
+pub fn drive_and_label(
+    track: &Track,
+    options: &RecordOptions,
+    driver: &mut dyn Driver,
+    expert_share: f64,
+) -> Result<Vec<Sample>> {
+    let mut rng = Rng::new(options.seed, "who drives");
+    let start = Start { reverse: options.reverse, ..Start::draw(track, options.seed) };
+    let speed_mps = options.speed_mph * MPS_PER_MPH;
+    let mut simulation = Simulation::new(track, start, speed_mps);
+    let mut eye = FrontCamera::new(track, options.seed);
+    let mut controller = SpeedController::default();
+    let way_m = options.laps * track.length_m;
+    let most_steps = (way_m / speed_mps.max(1.0) * 3.0) as u64 * STEPS_PER_S + 500;
+    let (mut samples, mut answer, mut frames, mut by_expert) = (Vec::new(), 0.0, 0, true);
+    for step in 0..most_steps {
+        if simulation.progress_m >= way_m {
+            break;
+        }
+        if step % STEPS_PER_S == 0 {
+            by_expert = rng.unit() < expert_share;
+        }
+        let label = pursuit(&simulation);
+        let speed_mph = simulation.car.speed_mps / MPS_PER_MPH;
+        let throttle = controller.throttle(options.speed_mph, speed_mph, STEP_S);
+        if step * DRIVE_HZ >= frames * STEPS_PER_S {
+            frames += 1;
+            let state = DriveState { simulation: &simulation, speed_mph };
+            answer = f64::from(driver.steer(eye.look(&simulation)?, &state));
+            answer = if answer.is_finite() { answer.clamp(-1.0, 1.0) } else { 0.0 };
+        }
+        if step % (STEPS_PER_S / options.hz) == 0 {
+            samples.push(Sample {
+                time_s: simulation.time_s(),
+                body: simulation.body_pose(),
+                steering: label,
+                throttle: throttle.max(0.0),
+                brake: (-throttle).max(0.0),
+                speed_mph,
+            });
+        }
+        simulation.step(Controls { steering: if by_expert { label } else { answer }, throttle });
+        if simulation.cte_m().abs() > LOST_M || simulation.at_wall {
+            simulation.put_back();
+        }
+    }
+    Ok(samples)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_lap_is_sampled_at_ten_hertz_and_holds_the_speed() {
+        let track = Track::load("forest").unwrap();
+        let samples = drive_expert(&track, &RecordOptions::default());
+        let expected = track.length_m / (20.0 * MPS_PER_MPH) * 10.0;
+        assert!((samples.len() as f64 - expected).abs() < 0.08 * expected, "{} of {expected}", samples.len());
+        assert!(samples.windows(2).all(|w| (w[1].time_s - w[0].time_s - 0.1).abs() < 1e-6));
+        let settled = &samples[100..];
+        assert!(settled.iter().all(|s| (s.speed_mph - 20.0).abs() < 2.5));
+    }
+
+    #[test]
+    fn whoever_drives_the_labels_are_the_experts() {
+        use crate::simulator::trial::driver::{Expert, Zero};
+        let track = Track::load("lake").unwrap();
+        let options = RecordOptions { laps: 0.3, ..Default::default() };
+        let recorded = drive_and_label(&track, &options, &mut Expert, 0.0).unwrap();
+        let plain = drive_expert(&track, &options);
+        assert!(
+            recorded.len() > 100 && recorded.len().abs_diff(plain.len()) < 10,
+            "{} {}",
+            recorded.len(),
+            plain.len()
+        );
+        assert!(recorded.iter().zip(&plain).all(|(a, b)| (a.steering - b.steering).abs() < 0.1));
+        // Who never steers drifts off the line, and the labels say how to get back.
+        let strength =
+            |samples: &[Sample]| samples.iter().map(|s| s.steering.abs()).sum::<f64>() / samples.len() as f64;
+        let zero = drive_and_label(&track, &options, &mut Zero, 0.0).unwrap();
+        let helped = drive_and_label(&track, &options, &mut Zero, 0.5).unwrap();
+        assert!(strength(&zero) > 2.0 * strength(&plain), "{} {}", strength(&zero), strength(&plain));
+        assert!(strength(&helped) < strength(&zero));
+    }
+
+    #[test]
+    fn recovery_steers_back_and_keyboard_labels_are_often_zero() {
+        let track = Track::load("lake").unwrap();
+        let recovery = drive_expert(&track, &RecordOptions { recovery: true, ..Default::default() });
+        let spread = |samples: &[Sample]| samples.iter().map(|s| s.steering.abs()).sum::<f64>() / samples.len() as f64;
+        let smooth = drive_expert(&track, &RecordOptions::default());
+        assert!(recovery.len() > 300 && spread(&recovery) > 1.5 * spread(&smooth));
+        let keys = drive_expert(&track, &RecordOptions { style: Style::Keyboard, ..Default::default() });
+        let zero =
+            |samples: &[Sample]| samples.iter().filter(|s| s.steering == 0.0).count() as f64 / samples.len() as f64;
+        assert!(zero(&keys) > 0.4 && zero(&smooth) < 0.05, "{} {}", zero(&keys), zero(&smooth));
+    }
+}

@@ -1,0 +1,135 @@
+//! What to record, and what is noted of a recording beside its log.
+
+use std::fs;
+use std::path::Path;
+
+use serde::Serialize;
+
+use crate::simulator::car::dynamics::STEPS_PER_S;
+use crate::simulator::car::expert::Style;
+use crate::simulator::track::Track;
+use crate::{Error, Result};
+
+/// Rows of the log for each second, unless told otherwise.
+pub const RECORD_HZ: u64 = 10;
+
+/// How the log is written.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum LogFormat {
+    /// As Udacity's sample data: a header, `", "` between fields, paths relative to the log.
+    #[default]
+    Sample,
+    /// As version 2 of the simulator: no header, `","` between fields, absolute paths.
+    V2,
+}
+
+/// What to record.
+#[derive(Clone, Debug)]
+pub struct RecordOptions {
+    /// Laps of normal driving, or with `recovery` laps along which the car is put off its line.
+    pub laps: f64,
+    /// Drive against the direction of the track's points.
+    pub reverse: bool,
+    /// Record only ways back to the line.
+    pub recovery: bool,
+    /// How the expert moves the wheel.
+    pub style: Style,
+    /// Draws where the drive begins, light and texture, and what happens on it.
+    pub seed: u64,
+    /// Speed to hold, mph.
+    pub speed_mph: f64,
+    /// Strength of a disturbance of the steering that the labels do not show: standard deviation of the steering.
+    pub noise: f64,
+    /// Rows of the log for each second: 1, 2, 5, 10, 25 or 50.
+    pub hz: u64,
+    /// How the log is written.
+    pub format: LogFormat,
+}
+
+impl RecordOptions {
+    /// Checks what any driver is bound to: speed and rows a second.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] with what would be possible.
+    pub fn check(&self) -> Result<()> {
+        if !(5.0..=30.0).contains(&self.speed_mph) {
+            return Err(Error::Usage(format!("speed {} mph: 5 to 30 mph can be recorded", self.speed_mph)));
+        }
+        if self.hz == 0 || !STEPS_PER_S.is_multiple_of(self.hz) {
+            return Err(Error::Usage(format!("{} rows a second: 1, 2, 5, 10, 25 or 50 can be recorded", self.hz)));
+        }
+        Ok(())
+    }
+}
+
+impl Default for RecordOptions {
+    fn default() -> Self {
+        RecordOptions {
+            laps: 1.0,
+            reverse: false,
+            recovery: false,
+            style: Style::Smooth,
+            seed: 1,
+            speed_mph: 20.0,
+            noise: 0.0,
+            hz: RECORD_HZ,
+            format: LogFormat::Sample,
+        }
+    }
+}
+
+/// What a recording is, beside the log.
+#[derive(Clone, Debug, Serialize)]
+pub struct RecordingInfo {
+    /// Track as given on the command line.
+    pub track: String,
+    /// Whether training must not see the track.
+    pub held_out: bool,
+    /// Seed of the recording.
+    pub seed: u64,
+    /// Laps asked for; laps driven, if by hand.
+    pub laps: f64,
+    /// Driven against the direction of the track's points.
+    pub reverse: bool,
+    /// Only ways back to the line.
+    pub recovery: bool,
+    /// `smooth` or `keyboard`; `manual` if a person drove.
+    pub style: String,
+    /// Speed held, mph; the highest, if by hand.
+    pub speed_mph: f64,
+    /// Disturbance of the steering.
+    pub noise: f64,
+    /// Rows for each second.
+    pub hz: u64,
+    /// Rows of the log.
+    pub rows: usize,
+}
+
+impl RecordingInfo {
+    /// What is said of `rows` rows that were driven as `options` ask for.
+    pub fn new(track: &Track, options: &RecordOptions, rows: usize) -> RecordingInfo {
+        RecordingInfo {
+            track: track.name().to_string(),
+            held_out: track.held_out(),
+            seed: options.seed,
+            laps: options.laps,
+            reverse: options.reverse,
+            recovery: options.recovery,
+            style: if options.style == Style::Keyboard { "keyboard" } else { "smooth" }.to_string(),
+            speed_mph: options.speed_mph,
+            noise: options.noise,
+            hz: options.hz,
+            rows,
+        }
+    }
+
+    /// Writes `recording.toml` into `folder`.
+    ///
+    /// # Errors
+    /// If it cannot be written.
+    pub fn write(&self, folder: &Path) -> Result<()> {
+        let side = folder.join("recording.toml");
+        let text = toml::to_string(self).map_err(|e| Error::data(&side, e.to_string()))?;
+        fs::write(&side, text).map_err(Error::io(&side))
+    }
+}

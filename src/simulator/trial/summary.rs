@@ -1,0 +1,106 @@
+//! How a driver is put to the test, and the measures of all its trials.
+
+use serde::{Deserialize, Serialize};
+
+use crate::simulator::car::speed::Speed;
+use crate::simulator::trial::outcome::{Trial, TrialOptions};
+
+/// How a driver is put to the test.
+#[derive(Clone, Debug)]
+pub struct DriveOptions {
+    /// Laps of each run.
+    pub laps: usize,
+    /// Runs; run `k` has seed `seed + k`.
+    pub runs: usize,
+    /// First seed.
+    pub seed: u64,
+    /// Speed to hold.
+    pub speed: Speed,
+    /// Time from a picture to the wheels, ms.
+    pub latency_ms: f64,
+    /// Standard deviation of a disturbance of the steering.
+    pub noise: f64,
+}
+
+impl Default for DriveOptions {
+    fn default() -> Self {
+        DriveOptions { laps: 1, runs: 10, seed: 1, speed: Speed::Fixed(20.0), latency_ms: 0.0, noise: 0.0 }
+    }
+}
+
+impl DriveOptions {
+    /// How a run of the drive is driven, free or assisted.
+    pub fn trial_options(&self, assisted: bool) -> TrialOptions {
+        let DriveOptions { laps, speed, latency_ms, noise, .. } = *self;
+        TrialOptions { laps, speed, latency_ms, noise, assisted }
+    }
+}
+
+/// A seed driven twice.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TrialPair {
+    /// The seed.
+    pub seed: u64,
+    /// Nobody helps.
+    pub free: Trial,
+    /// The car is put back when it is too far from the line.
+    pub assisted: Trial,
+}
+
+/// The measures of a drive; the fields of `drive --json`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct DriveSummary {
+    /// Track as given on the command line.
+    pub track: String,
+    /// Whether training must not see the track.
+    pub held_out: bool,
+    /// Held-out tracks that the driver was trained on all the same; whoever knows the driver sets it.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub trained_on_held_out: Vec<String>,
+    /// Seeds driven.
+    pub runs: usize,
+    /// Laps completed without help.
+    pub laps_completed: usize,
+    /// Laps asked for.
+    pub laps_total: usize,
+    /// Runs with all laps completed: 95 % interval (Wilson) of their share.
+    pub completed_low: f64,
+    /// See `completed_low`.
+    pub completed_high: f64,
+    /// Share of the assisted time in which nobody had to help, %.
+    pub autonomy_percent: f64,
+    /// Times the car was put back in assisted runs.
+    pub interventions: usize,
+    /// The same for each km.
+    pub interventions_per_km: f64,
+    /// Way of the free runs, m.
+    pub distance_m: f64,
+    /// Distance from the line in free runs: mean, m.
+    pub cte_mean_m: f64,
+    /// Its root mean square, m.
+    pub cte_rms_m: f64,
+    /// Its 95th percentile, m.
+    pub cte_p95_m: f64,
+    /// Time with more than two wheels off the road in free runs, s.
+    pub off_road_s: f64,
+    /// Free runs that hit a wall.
+    pub crashes: usize,
+    /// Mean speed of the free runs, mph.
+    pub mean_speed_mph: f64,
+    /// Root mean square rate of the steering, deg/s, over the free runs: what the wheel trembles.
+    pub whiteness_deg_s: f64,
+    /// The same for the expert with the same seeds.
+    pub expert_whiteness_deg_s: f64,
+    /// Simulated seconds for each second in which a thread drives (the expert's runs left out), times the threads that its
+    /// runs can keep at work; the one number that differs between runs.
+    pub realtime_factor: f64,
+}
+
+/// A drive: every run and their summary.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DriveResult {
+    /// Trials in the order of their seeds.
+    pub trials: Vec<TrialPair>,
+    /// Measures over all runs.
+    pub summary: DriveSummary,
+}
