@@ -61,12 +61,17 @@ pub(crate) fn clean(folder: &Path) {
     remove_left_over(folder, ".");
 }
 
+/// Whether the name of `entry` is that of something unfinished.
+pub(crate) fn is_left_over(entry: &fs::DirEntry) -> bool {
+    let name = entry.file_name();
+    let name = name.to_string_lossy();
+    name.starts_with('.') && name.contains(MARK)
+}
+
 /// As [`clean`], for names that begin with `prefix`. What cannot be removed stays: it does no harm.
 fn remove_left_over(folder: &Path, prefix: &str) {
     for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
-        let name = entry.file_name();
-        let name = name.to_string_lossy();
-        if !(name.starts_with(prefix) && name.contains(MARK)) {
+        if !(entry.file_name().to_string_lossy().starts_with(prefix) && is_left_over(&entry)) {
             continue;
         }
         let path = entry.path();

@@ -1,6 +1,8 @@
 //! Decoding of JPEG and PNG images to 8-bit RGB.
 
+use std::borrow::Cow;
 use std::io::Cursor;
+
 use zune_jpeg::JpegDecoder;
 use zune_jpeg::zune_core::bytestream::ZCursor;
 use zune_jpeg::zune_core::colorspace::ColorSpace;
@@ -10,6 +12,12 @@ use super::RgbImage;
 
 /// Largest height or width that is decoded, in pixels.
 pub const MAX_SIDE: usize = 8192;
+
+/// Most pixels of an image that is decoded: 16 megapixels.
+pub const MAX_PIXELS: usize = 16 << 20;
+
+/// Most memory that decoding a PNG may take, bytes.
+const MAX_DECODED_LEN: u64 = 64 << 20;
 
 /// First bytes of every PNG file.
 const PNG_SIGNATURE: &[u8] = b"\x89PNG\r\n\x1a\n";
@@ -76,6 +84,7 @@ fn decode_jpeg(bytes: &[u8], max_side: usize, image: &mut RgbImage) -> Result<()
     let failed = |error: zune_jpeg::errors::DecodeErrors| format!("the JPEG cannot be decoded: {error:?}");
     decoder.decode_headers().map_err(failed)?;
     let (width, height) = decoder.dimensions().ok_or("the JPEG has no size")?;
+    check_pixels(height, width)?;
     image.pixels.resize(width * height * 3, 0);
     if decoder.output_buffer_size() != Some(image.pixels.len()) {
         return Err("the JPEG has colours that cannot be turned into RGB".into());
@@ -86,16 +95,47 @@ fn decode_jpeg(bytes: &[u8], max_side: usize, image: &mut RgbImage) -> Result<()
 }
 
 fn decode_png(bytes: &[u8], max_side: usize, image: &mut RgbImage) -> Result<(), String> {
-    let mut reader = image::ImageReader::with_format(Cursor::new(bytes), image::ImageFormat::Png);
+    let [height, width] = image_size(bytes)?;
+    check_pixels(height, width)?;
+    let bytes = without_metadata(bytes);
+    let mut reader = image::ImageReader::with_format(Cursor::new(&*bytes), image::ImageFormat::Png);
     let mut limits = image::Limits::default();
     limits.max_image_width = Some(max_side as u32);
     limits.max_image_height = Some(max_side as u32);
+    limits.max_alloc = Some(MAX_DECODED_LEN);
     reader.limits(limits);
     let decoded = reader.decode().map_err(|error| format!("the PNG cannot be decoded: {error}"))?.into_rgb8();
     (image.height, image.width) = (decoded.height() as usize, decoded.width() as usize);
     image.pixels.clear();
     image.pixels.extend_from_slice(decoded.as_raw());
     Ok(())
+}
+
+fn check_pixels(height: usize, width: usize) -> Result<(), String> {
+    match height.checked_mul(width) {
+        Some(pixels) if pixels <= MAX_PIXELS => Ok(()),
+        _ => Err(format!("{width}x{height} pixels; at most 16 megapixels are decoded")),
+    }
+}
+
+/// A PNG without the chunks that say nothing about its pixels: profiles and texts, of which a few bytes can unpack to
+/// hundreds of megabytes.
+fn without_metadata(bytes: &[u8]) -> Cow<'_, [u8]> {
+    let mut kept = PNG_SIGNATURE.to_vec();
+    let mut rest = &bytes[PNG_SIGNATURE.len()..];
+    while let [a, b, c, d, kind @ ..] = rest
+        && let Some(kind) = kind.first_chunk::<4>()
+    {
+        let len = u32::from_be_bytes([*a, *b, *c, *d]) as usize;
+        // Length, kind and checksum stand around the content.
+        let (chunk, after) = rest.split_at(len.saturating_add(12).min(rest.len()));
+        if !matches!(kind, b"iCCP" | b"tEXt" | b"zTXt" | b"iTXt" | b"eXIf") {
+            kept.extend_from_slice(chunk);
+        }
+        rest = after;
+    }
+    kept.extend_from_slice(rest);
+    if kept.len() == bytes.len() { Cow::Borrowed(bytes) } else { Cow::Owned(kept) }
 }
 
 #[cfg(test)]

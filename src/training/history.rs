@@ -39,12 +39,16 @@ pub struct EpochRecord {
 ///
 /// [`Error::Io`].
 pub fn write_history(path: &Path, history: &[EpochRecord]) -> Result<()> {
+    atomic_file::write(path, &history_csv(path, history)?)
+}
+
+/// `history` as the CSV of the file `path`.
+pub(super) fn history_csv(path: &Path, history: &[EpochRecord]) -> Result<Vec<u8>> {
     let mut writer = csv::Writer::from_writer(Vec::new());
     for record in history {
         writer.serialize(record).map_err(|e| Error::data(path, e.to_string()))?;
     }
-    let bytes = writer.into_inner().map_err(|e| Error::data(path, e.to_string()))?;
-    atomic_file::write(path, &bytes)
+    writer.into_inner().map_err(|e| Error::data(path, e.to_string()))
 }
 
 /// Reads what [`write_history`] wrote.

@@ -93,6 +93,10 @@ impl Parameters {
     }
 }
 
+/// Most parameters of a network: 400 MB of them, and several times that in training. A recipe or a model file cannot ask for
+/// more memory than the machine has by a slip.
+pub const MAX_PARAMETERS: usize = 100_000_000;
+
 impl Network {
     /// The network of `specs` over images of `input`, computed with `backend`: an [`Isa`], or one with a convolution algorithm.
     ///
@@ -114,7 +118,14 @@ impl Network {
                 [(layer.params(), &mut params_end, true), (layer.statistics(), &mut statistics_end, false)]
             {
                 for spec in specs {
-                    let range = *end..*end + spec.len();
+                    let message = || {
+                        format!("the network has more than {MAX_PARAMETERS} parameters; take fewer units or channels")
+                    };
+                    let len = spec.shape.iter().try_fold(1usize, |len, n| len.checked_mul(*n));
+                    let Some(len) = len.filter(|len| *len <= MAX_PARAMETERS - *end) else {
+                        return Err(Error::Network { layer: name.clone(), message: message() });
+                    };
+                    let range = *end..*end + len;
                     *end = range.end;
                     let name = format!("{name}.{}", spec.name);
                     network.tensors.push(Tensor { name, spec, trainable, range, frozen: false });
