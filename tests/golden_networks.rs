@@ -11,7 +11,8 @@ use steersman::engine::loss::Loss;
 use steersman::engine::network::{LayerSpec, Network, Parameters, StepInput, TrainingPlan};
 use steersman::engine::optimizer::{Optimizer, OptimizerSpec};
 use steersman::recipe::Recipe;
-use steersman_kernels::Isa;
+use steersman_kernels::conv::ConvAlgorithm;
+use steersman_kernels::{Backend, Isa};
 
 const FORWARD: f64 = 1e-4;
 const GRADIENT: f64 = 1e-3;
@@ -78,14 +79,14 @@ fn golden_name(network: &str, layer: &str) -> String {
     }
 }
 
-fn network(name: &str, isa: Isa) -> Network {
+fn network(name: &str, backend: Backend) -> Network {
     let mut recipe = Recipe::find(name, &[]).unwrap();
     for layer in &mut recipe.layers {
         if let LayerSpec::Dropout(dropout) = layer {
             dropout.drop_probability = 0.0;
         }
     }
-    recipe.network(isa).unwrap()
+    recipe.network(backend).unwrap()
 }
 
 fn parameters(network: &Network) -> Parameters {
@@ -172,9 +173,9 @@ impl LayerByLayer {
     }
 }
 
-fn check(name: &str, isa: Isa) {
+fn check(name: &str, backend: Backend) {
     let golden = Golden::read(name);
-    let network = network(name, isa);
+    let network = network(name, backend);
     let (x, labels) = batch(name, &network, golden.batch);
     let mut failures = Vec::new();
 
@@ -254,20 +255,26 @@ fn check(name: &str, isa: Isa) {
             .collect();
         golden.compare(&format!("change/{}", tensor.name), &change, CHANGE, &mut failures);
     }
-    assert!(failures.is_empty(), "{name} on {}:\n{}", isa.name(), failures.join("\n"));
+    assert!(failures.is_empty(), "{name} on {}, {}:\n{}", backend.isa.name(), backend.conv, failures.join("\n"));
+}
+
+/// Every instruction set with the algorithms of its choice, and the textbook algorithm on the best.
+fn backends() -> impl Iterator<Item = Backend> {
+    let auto = Isa::available().into_iter().map(|isa| Backend { isa, conv: ConvAlgorithm::Auto });
+    auto.chain([Backend { isa: Isa::best(), conv: ConvAlgorithm::Im2col }])
 }
 
 #[test]
 fn hyper_agrees_with_keras() {
-    Isa::available().into_iter().for_each(|isa| check("hyper", isa));
+    backends().for_each(|backend| check("hyper", backend));
 }
 
 #[test]
 fn lenet_agrees_with_keras() {
-    Isa::available().into_iter().for_each(|isa| check("lenet", isa));
+    backends().for_each(|backend| check("lenet", backend));
 }
 
 #[test]
 fn pilotnet_agrees_with_keras() {
-    Isa::available().into_iter().for_each(|isa| check("pilotnet", isa));
+    backends().for_each(|backend| check("pilotnet", backend));
 }

@@ -9,7 +9,8 @@ use steersman::engine::network::{Network, Parameters, StepInput, Tensor, Trainin
 use steersman::engine::random::{Purpose, rng, uniform, unit};
 use steersman::engine::tensor::Shape;
 use steersman::recipe::Recipe;
-use steersman_kernels::Isa;
+use steersman_kernels::conv::ConvAlgorithm;
+use steersman_kernels::{Backend, Isa};
 
 const IMAGES: usize = 6;
 const DIRECTIONS: u64 = 4;
@@ -50,9 +51,9 @@ struct Check {
 }
 
 impl Check {
-    fn new(recipe: &str, size: &str, loss: Loss, isa: Isa) -> Check {
+    fn new(recipe: &str, size: &str, loss: Loss, backend: Backend) -> Check {
         let recipe = Recipe::find(recipe, &[format!("preprocessing.resize={size}")]).unwrap();
-        let network = recipe.network(isa).unwrap();
+        let network = recipe.network(backend).unwrap();
         let mut random = rng(11, Purpose::Test, 0, 0);
         // Grey levels where the network scales them itself.
         let (low, high) = if recipe.preprocessing.scale == 1.0 { (0.0, 255.0) } else { (-0.5, 0.5) };
@@ -137,9 +138,11 @@ impl Check {
 }
 
 fn check(recipe: &str, size: &str) {
-    for loss in [Loss::MeanSquaredError {}, Loss::Huber { delta: 0.3 }] {
-        let failures = Check::new(recipe, size, loss, Isa::best()).failures();
-        assert!(failures.is_empty(), "{recipe}, {loss:?}: gradients off: {failures:?}");
+    for conv in [ConvAlgorithm::Auto, ConvAlgorithm::Im2col] {
+        for loss in [Loss::MeanSquaredError {}, Loss::Huber { delta: 0.3 }] {
+            let failures = Check::new(recipe, size, loss, Backend { isa: Isa::best(), conv }).failures();
+            assert!(failures.is_empty(), "{recipe}, {conv}, {loss:?}: gradients off: {failures:?}");
+        }
     }
 }
 

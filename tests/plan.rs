@@ -9,7 +9,8 @@ use steersman::engine::optimizer::Optimizer;
 use steersman::engine::random::{Purpose, rng, uniform};
 use steersman::engine::tensor::Shape;
 use steersman::recipe::Recipe;
-use steersman_kernels::Isa;
+use steersman_kernels::conv::ConvAlgorithm;
+use steersman_kernels::{Backend, Isa};
 
 #[global_allocator]
 static ALLOCATOR: dhat::Alloc = dhat::Alloc;
@@ -26,8 +27,12 @@ struct Setup {
 
 impl Setup {
     fn new(recipe: &str, size: &str, images: usize) -> Setup {
+        Setup::with(recipe, size, images, ConvAlgorithm::Auto)
+    }
+
+    fn with(recipe: &str, size: &str, images: usize, conv: ConvAlgorithm) -> Setup {
         let recipe = Recipe::find(recipe, &[format!("preprocessing.resize={size}")]).unwrap();
-        let network = recipe.network(Isa::best()).unwrap();
+        let network = recipe.network(Backend { isa: Isa::best(), conv }).unwrap();
         let mut random = rng(1, Purpose::Test, 0, 0);
         // Grey levels where the network scales them itself.
         let (low, high) = if recipe.preprocessing.scale == 1.0 { (0.0, 255.0) } else { (-0.5, 0.5) };
@@ -96,6 +101,29 @@ fn a_training_step_allocates_nothing() {
 }
 
 #[test]
+fn a_step_by_im2col_allocates_nothing_but_the_packing_buffers_of_matrixmultiply() {
+    let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
+    let _profiler = dhat::Profiler::builder().testing().build();
+    for (recipe, size) in NETWORKS {
+        let setup = Setup::with(recipe, size, 9, ConvAlgorithm::Im2col);
+        let convolutions = setup.network.layers().iter().filter(|l| matches!(l.spec, LayerSpec::Conv2d { .. })).count();
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(2).build().unwrap();
+        let allocated = pool.install(|| {
+            let (mut plan, mut optimizer) = (TrainingPlan::new(&setup.network, 9), setup.optimizer());
+            let mut parameters = setup.network.initialize(1);
+            for _ in 0..3 {
+                setup.step(&mut plan, &mut optimizer, &mut parameters);
+            }
+            allocations(|| {
+                setup.step(&mut plan, &mut optimizer, &mut parameters);
+            })
+        });
+        // One for each product of each image: forward and both gradients, without the input gradient of the first layer.
+        assert_eq!(allocated, 9 * (3 * convolutions as u64 - 1), "{recipe}");
+    }
+}
+
+#[test]
 fn a_prediction_allocates_nothing() {
     let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
     let _profiler = dhat::Profiler::builder().testing().build();
@@ -113,10 +141,13 @@ fn training_gives_the_same_bits_for_any_number_of_threads_and_any_capacity() {
     let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
     for (recipe, size) in NETWORKS {
         for images in [1, 3, 16, 29, 37] {
-            let setup = Setup::new(recipe, size, images);
-            let one = setup.train(1, images);
-            for (threads, capacity) in [(2, images), (5, images), (2, 40), (2, 64)] {
-                assert!(one == setup.train(threads, capacity), "{recipe}, {images} images, {threads} threads");
+            for conv in [ConvAlgorithm::Auto, ConvAlgorithm::Im2col] {
+                let setup = Setup::with(recipe, size, images, conv);
+                let one = setup.train(1, images);
+                for (threads, capacity) in [(2, images), (5, images), (2, 40), (2, 64)] {
+                    let same = one == setup.train(threads, capacity);
+                    assert!(same, "{recipe}, {conv}, {images} images, {threads} threads");
+                }
             }
         }
     }

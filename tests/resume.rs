@@ -78,6 +78,33 @@ fn a_killed_run_goes_on_to_the_same_bits() {
     assert_same_result(folder.path(), "killed", &whole);
 }
 
+#[test]
+fn a_run_by_im2col_goes_on_by_im2col() {
+    let folder = tempfile::tempdir().unwrap();
+    painted_log::write(&folder.path().join("log"), 400, "");
+    let auto = json(folder.path(), &[&ARGS[..], &["--out", "auto", "--algorithm", "auto"]].concat());
+    assert!(auto.get("algorithm").is_none());
+    let whole = json(folder.path(), &[&ARGS[..], &["--out", "whole", "--algorithm", "im2col"]].concat());
+    assert_eq!(whole["algorithm"], "im2col");
+    assert_ne!(whole["weights_hash"], auto["weights_hash"], "another order of summation, other last bits");
+    let by_environment =
+        steersman(folder.path()).args(ARGS).args(["--out", "named"]).env("STEERSMAN_CONV", "im2col").output().unwrap();
+    assert!(by_environment.status.success());
+    let named: serde_json::Value =
+        serde_json::from_slice(by_environment.stdout.trim_ascii().rsplit(|&b| b == b'\n').next().unwrap()).unwrap();
+    assert_eq!(named["weights_hash"], whole["weights_hash"]);
+    let args = [&ARGS[..], &["--out", "killed", "--algorithm", "im2col"]].concat();
+    let mut child = steersman(folder.path()).args(args).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+    wait_for_second_epoch(folder.path(), "killed");
+    child.kill().unwrap();
+    child.wait().unwrap();
+    assert!(!folder.path().join("killed/result.json").exists(), "it was finished before it could be killed");
+    assert_same_result(folder.path(), "killed", &whole);
+    let unknown = steersman(folder.path()).args(["train", "log", "--algorithm", "gemm"]).output().unwrap();
+    let message = String::from_utf8_lossy(&unknown.stderr);
+    assert!(!unknown.status.success() && message.contains("the algorithms are auto and im2col"), "{message}");
+}
+
 #[cfg(unix)]
 #[test]
 fn ctrl_c_saves_in_the_middle_of_an_epoch_and_the_run_goes_on_to_the_same_bits() {

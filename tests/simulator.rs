@@ -291,6 +291,11 @@ fn every_report_on_a_model_says_what_held_out_tracks_it_was_trained_on() {
     let (done, _, message) = go("experiment split --quick --recording kept");
     assert!(!done && message.contains("--force-held-out") && !folder.path().join("runs").exists(), "{message}");
     let short = "--recipe lenet --set epochs=1 --cache 64";
+    for kept in ["kept", "kept/driving_log.csv", "free kept"] {
+        let (done, _, message) = go(&format!("train {kept} {short} --out refused"));
+        assert!(!done && message.contains("show coast,") && message.contains("--force-held-out"), "{kept}: {message}");
+        assert!(!folder.path().join("refused").exists(), "{kept}: nothing is trained");
+    }
     let (done, text, message) = go(&format!("train kept --force-held-out {short} --out a"));
     assert!(done && text.contains("the model was trained on coast, held-out"), "{text}{message}");
     // What began with such a model was trained there too.

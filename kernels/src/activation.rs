@@ -35,7 +35,7 @@ fn expm1_of_negative(x: f32) -> f32 {
 }
 
 per_isa! {
-    /// `y = max(x, 0)`.
+    /// `y = max(x, 0)`; a NaN becomes 0. All other activations pass a NaN on.
     pub fn relu_forward<S>(_simd: S, x: &[f32], y: &mut [f32]) {
         assert_eq!(x.len(), y.len(), "relu_forward: x and y differ in length");
         for (y, &x) in y.iter_mut().zip(x) {
@@ -45,7 +45,7 @@ per_isa! {
 }
 
 per_isa! {
-    /// The gradient of [`relu_forward`] from its output `y`; `dx` is overwritten.
+    /// The gradient of [`relu_forward`], `y = max(x, 0)`, from its output `y`; `dx` is overwritten.
     pub fn relu_backward<S>(_simd: S, y: &[f32], dy: &[f32], dx: &mut [f32]) {
         assert!(y.len() == dy.len() && y.len() == dx.len(), "relu_backward: y, dy and dx differ in length");
         for ((dx, &dy), &y) in dx.iter_mut().zip(dy).zip(y) {
@@ -60,14 +60,14 @@ per_isa! {
         assert_eq!(x.len(), y.len(), "elu_forward: x and y differ in length");
         for (y, &x) in y.iter_mut().zip(x) {
             let negative = alpha * expm1_of_negative(if x < 0.0 { x } else { 0.0 });
-            // A NaN falls through to the second arm of neither comparison above, so pass it on here.
+            // A NaN is neither below nor above 0: it is passed on here.
             *y = if x <= 0.0 { negative } else { x };
         }
     }
 }
 
 per_isa! {
-    /// The gradient of [`elu_forward`] from its output `y`; `dx` is overwritten.
+    /// The gradient of [`elu_forward`], `y = x` or `alpha (e^x - 1)`, from its output `y`; `dx` is overwritten.
     pub fn elu_backward<S>(_simd: S, alpha: f32, y: &[f32], dy: &[f32], dx: &mut [f32]) {
         assert!(y.len() == dy.len() && y.len() == dx.len(), "elu_backward: y, dy and dx differ in length");
         for ((dx, &dy), &y) in dx.iter_mut().zip(dy).zip(y) {
@@ -87,7 +87,7 @@ per_isa! {
 }
 
 per_isa! {
-    /// The gradient of [`leaky_relu_forward`] from its input `x`; `dx` is overwritten.
+    /// The gradient of [`leaky_relu_forward`], `y = x` or `slope x`, from its input `x`; `dx` is overwritten.
     pub fn leaky_relu_backward<S>(_simd: S, slope: f32, x: &[f32], dy: &[f32], dx: &mut [f32]) {
         assert!(x.len() == dy.len() && x.len() == dx.len(), "leaky_relu_backward: x, dy and dx differ in length");
         for ((dx, &dy), &x) in dx.iter_mut().zip(dy).zip(x) {
@@ -110,7 +110,7 @@ per_isa! {
 }
 
 per_isa! {
-    /// The gradient of [`tanh_forward`] from its output `y`; `dx` is overwritten.
+    /// The gradient of [`tanh_forward`], `y = tanh x`, from its output `y`; `dx` is overwritten.
     pub fn tanh_backward<S>(_simd: S, y: &[f32], dy: &[f32], dx: &mut [f32]) {
         assert!(y.len() == dy.len() && y.len() == dx.len(), "tanh_backward: y, dy and dx differ in length");
         for ((dx, &dy), &y) in dx.iter_mut().zip(dy).zip(y) {
@@ -130,7 +130,8 @@ per_isa! {
 }
 
 per_isa! {
-    /// The gradient of [`softsign_forward`] from its output `y`, as `1 - |y| = 1 / (1 + |x|)`; `dx` is overwritten.
+    /// The gradient of [`softsign_forward`], `y = x / (1 + |x|)`, from its output `y`, as `1 - |y| = 1 / (1 + |x|)`; `dx` is
+    /// overwritten.
     pub fn softsign_backward<S>(_simd: S, y: &[f32], dy: &[f32], dx: &mut [f32]) {
         assert!(y.len() == dy.len() && y.len() == dx.len(), "softsign_backward: y, dy and dx differ in length");
         for ((dx, &dy), &y) in dx.iter_mut().zip(dy).zip(y) {
@@ -180,8 +181,8 @@ per_isa! {
 per_isa! {
     /// `y = x` where `x > 0`, else `slope x`, for `n` images.
     ///
-    /// Each slope serves `repeat` consecutive elements of an image: 1 for a slope per position, `h * w` for a slope
-    /// per channel. An image has `slopes.len() * repeat` elements.
+    /// Each slope serves `repeat` consecutive elements of an image: 1 for one slope for each position, `h * w` for one slope for each
+    /// channel. An image has `slopes.len() * repeat` elements.
     pub fn prelu_forward<S>(_simd: S, n: usize, slopes: &[f32], repeat: usize, x: &[f32], y: &mut [f32]) {
         let image = slopes.len() * repeat;
         assert!(x.len() == n * image && y.len() == n * image, "prelu_forward: x or y is not n images long");
@@ -205,7 +206,8 @@ per_isa! {
 }
 
 per_isa! {
-    /// The gradients of [`prelu_forward`]: `dx` is overwritten, the gradient of the slopes is added to `dslopes`.
+    /// The gradients of [`prelu_forward`], `y = x` or `slope x`: `dx` is overwritten, the gradient of the slopes is added to
+    /// `dslopes`.
     pub fn prelu_backward<S>(
         _simd: S,
         n: usize,

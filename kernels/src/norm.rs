@@ -1,7 +1,7 @@
 //! The passes of batch normalisation (Ioffe and Szegedy 2015) over `[n][c][hw]` tensors.
 //!
-//! Sums are taken in `f32` over short strips, less the plane's first element, and added up in `f64`: the variance is a difference
-//! of two sums, and several shards of a batch are added up.
+//! The variance is a difference of two sums, and the sums of several shards of a batch are added up. So elements are summed less the
+//! plane's first element, in `f32` over short strips, and the strips are added up in `f64`.
 
 use crate::simd::{Simd, get};
 
@@ -16,12 +16,13 @@ fn add_block(sums: &mut [f64; WIDTH], block: [f32; WIDTH]) {
     }
 }
 
-/// Vectors that are summed in single precision before their sum is added up in double.
+/// Vectors that are summed in single precision before their sum is added to one in double precision.
 const STRIP: usize = 32;
 
-/// The sum of a plane and the sum of its squares. The first element is taken away from all others before they are
-/// summed, so that the squares of what deviates little from a large mean are exact enough in single precision, and those
-/// of a plane of one value 0.
+/// The sum of a plane and the sum of its squares.
+///
+/// The first element is subtracted from all elements before they are summed. Then the squares are exact enough in single precision
+/// even if the elements deviate little from a large mean, and a plane of equal elements has a variance of exactly 0.
 #[inline(always)]
 fn plane_sums<S: Simd>(simd: S, x: &[f32]) -> (f64, f64) {
     let Some(&origin) = x.first() else { return (0.0, 0.0) };

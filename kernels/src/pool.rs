@@ -1,4 +1,9 @@
-//! Maximum and average pooling over windows that lie fully inside the image (no padding, sizes rounded down).
+//! Max and average pooling over windows that lie fully inside the image (no padding, sizes rounded down).
+//!
+//! # NaN
+//! [`max_forward`] skips a NaN; a window of NaN alone gives minus infinity, and its gradient reaches no input.
+//! [`max_forward_with_argmax`] compares down the columns first: a NaN in the upper row hides its column, and one in the upper left
+//! place makes the window NaN. [`average_forward`] passes a NaN on.
 
 use crate::simd::{Simd, get, get_first, put};
 
@@ -115,7 +120,7 @@ fn max_of_strip<S: Simd>(
     y: &mut [f32],
     argmax: &mut [u32],
 ) {
-    // Down the columns first, vector by vector: the largest of each and its row.
+    // Down the columns first, vector by vector: the maximum of each column and its row.
     let columns = 4 * y.len();
     let (mut max, mut row_of) = ([f32::NEG_INFINITY; STRIP], [0.0f32; STRIP]);
     let whole = columns - columns % S::LANES;
@@ -130,7 +135,7 @@ fn max_of_strip<S: Simd>(
         put(simd, &mut row_of, at, best_row);
     }
     if whole < columns {
-        // What the lanes after the last column hold is not looked at.
+        // The lanes after the last column are not used.
         let rest = columns - whole;
         let (mut best, mut best_row) = (get_first(simd, rows, whole, rest), simd.splat(0.0));
         for ky in 1..kh {
@@ -178,8 +183,8 @@ fn max_of_windows(y: &mut [f32], row: &[f32], kw: usize, stride: usize) {
 }
 
 per_isa! {
-    /// The gradient of [`max_forward`]: the first position in row-major window order that equals the maximum receives
-    /// `dy`; where windows overlap, gradients add up. `dx` is overwritten.
+    /// The gradient of [`max_forward`], `y = max of window`: the first maximum in row-major order receives `dy`. Gradients of
+    /// overlapping windows are added up. `dx` is overwritten.
     pub fn max_backward<S>(
         _simd: S,
         shape: &PoolShape,
@@ -221,7 +226,7 @@ fn max_back_blocks<const K: usize>(w: usize, x: &[f32], y: &[f32], dy: &[f32], d
     /// Windows at a time: their state stays in registers or the first-level cache.
     const STRIP: usize = 64;
     for (strip, (y, dy)) in y.chunks(STRIP).zip(dy.chunks(STRIP)).enumerate() {
-        // What each window still looks for: its maximum, then NaN, which equals nothing.
+        // The value that each window still searches: its maximum, then NaN, which equals nothing.
         let mut sought = [f32::NAN; STRIP];
         sought[..y.len()].copy_from_slice(y);
         let mut gradient = [0.0; STRIP];
@@ -296,8 +301,8 @@ per_isa! {
 }
 
 per_isa! {
-    /// The gradient of [`average_forward`]: each position of a window receives an equal share of `dy`; where windows
-    /// overlap, gradients add up. `dx` is overwritten.
+    /// The gradient of [`average_forward`], `y = mean of window`: each position of a window receives an equal share of `dy`.
+    /// Gradients of overlapping windows are added up. `dx` is overwritten.
     pub fn average_backward<S>(_simd: S, shape: &PoolShape, n: usize, dy: &[f32], dx: &mut [f32]) {
         shape.check("average_backward", n, dx.len(), dy.len());
         let &PoolShape { c, h, w, kh, kw, stride_h, stride_w } = shape;

@@ -6,6 +6,8 @@ mod convolutions;
 mod elementwise;
 #[path = "against_reference/fused.rs"]
 mod fused;
+#[path = "against_reference/nan.rs"]
+mod nan;
 #[path = "against_reference/products.rs"]
 mod products;
 

@@ -12,8 +12,10 @@ use crate::files::atomic_file;
 use crate::pilot::Pilot;
 use crate::report::explain::counterfactual::{Counterfactuals, examine};
 use crate::report::explain::exhibits::{Exhibit, exhibits};
+use crate::report::explain::findings::Finding;
 use crate::report::explain::footage::Footage;
 use crate::report::pages::explanation;
+use crate::report::tone::Tone;
 
 /// Show what a model looks at: saliency, filters, feature maps, and what happens when the picture is changed
 #[derive(Debug, Args)]
@@ -99,8 +101,13 @@ fn text(found: &Counterfactuals) -> String {
         text += &format!("{change:<34} {moved:>9} {p95:>11} {right_way:>10} {error:>8}  {passed:<4} {verdict}\n");
     }
     text.push('\n');
-    for sentence in &found.verdict {
-        text += &format!("{sentence}\n");
+    for Finding { tone, text: sentence } in &found.findings {
+        let mark = match tone {
+            Tone::Good => "good: ",
+            Tone::Neutral => "note: ",
+            Tone::Warning => "warning: ",
+        };
+        text += &format!("{mark}{sentence}\n");
     }
     text
 }

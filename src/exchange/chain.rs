@@ -7,7 +7,7 @@ use crate::error::{Error, Result};
 
 /// One operation of the chain.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) struct Step {
+pub(crate) struct ChainStep {
     /// Name of the layer.
     pub name: String,
     pub input: Shape,
@@ -16,7 +16,7 @@ pub(crate) struct Step {
     pub form: ExportForm,
 }
 
-impl Step {
+impl ChainStep {
     /// How many weights or slopes it has.
     pub fn weight_len(&self) -> usize {
         match &self.form {
@@ -35,38 +35,44 @@ impl Step {
 }
 
 /// The operations of `network` with `parameters`; layers that do nothing in evaluation are left out.
-pub(crate) fn chain(network: &Network, parameters: &Parameters) -> Vec<Step> {
+pub(crate) fn chain(network: &Network, parameters: &Parameters) -> Vec<ChainStep> {
     let step = |layer: &NamedLayer| {
         let (input, output) = (layer.layer.input(), layer.layer.output());
         let params = &parameters.values[layer.params.clone()];
         let statistics = &parameters.statistics[layer.statistics.clone()];
         let form = layer.spec.export_form(input, params, statistics);
-        (form != ExportForm::Identity).then(|| Step { name: layer.name.clone(), input, output, form })
+        (form != ExportForm::Identity).then(|| ChainStep { name: layer.name.clone(), input, output, form })
     };
     network.layers().iter().filter_map(step).collect()
 }
 
 /// Batch normalisation of evaluation is `x · scale + shift` in each channel.
-pub(crate) fn scale_and_shift(gamma: &[f32], beta: &[f32], mean: &[f32], variance: &[f32], epsilon: f32) -> Affine {
+pub(crate) fn scale_and_shift(
+    gamma: &[f32],
+    beta: &[f32],
+    mean: &[f32],
+    variance: &[f32],
+    epsilon: f32,
+) -> ChannelAffine {
     let channel = |i: usize| {
         let scale = f64::from(gamma[i]) / (f64::from(variance[i]) + f64::from(epsilon)).sqrt();
         (scale, f64::from(beta[i]) - f64::from(mean[i]) * scale)
     };
     let (scale, shift) = (0..gamma.len()).map(channel).unzip();
-    Affine { scale, shift }
+    ChannelAffine { scale, shift }
 }
 
 /// Refuses numbers that are not finite, which a file of an exported model could not say or would compute nonsense with: those
 /// that folding made, and the scales and shifts of the batch normalisation that is left, as the 32-bit numbers they become.
-pub(crate) fn check_finite(steps: &[Step]) -> Result<()> {
+pub(crate) fn check_finite(steps: &[ChainStep]) -> Result<()> {
     let all_finite = |values: &[f32]| values.iter().all(|value| value.is_finite());
-    for Step { name, form, .. } in steps {
+    for ChainStep { name, form, .. } in steps {
         let is_finite = match form {
             ExportForm::Conv { weight, bias, .. } | ExportForm::Dense { weight, bias } => {
                 all_finite(weight) && all_finite(bias)
             }
             ExportForm::BatchNorm { gamma, beta, mean, variance, epsilon } => {
-                let Affine { scale, shift } = scale_and_shift(gamma, beta, mean, variance, *epsilon);
+                let ChannelAffine { scale, shift } = scale_and_shift(gamma, beta, mean, variance, *epsilon);
                 scale.iter().chain(&shift).all(|value| (*value as f32).is_finite())
             }
             ExportForm::PRelu { slopes } => all_finite(slopes),
@@ -87,14 +93,14 @@ pub(crate) fn check_finite(steps: &[Step]) -> Result<()> {
 }
 
 /// `x · scale + shift` in each channel.
-pub(crate) struct Affine {
+pub(crate) struct ChannelAffine {
     pub scale: Vec<f64>,
     pub shift: Vec<f64>,
 }
 
 /// Merges every batch normalisation that directly follows a convolution or dense layer into its weights; others stay.
-pub(crate) fn fold_batch_norm(chain: Vec<Step>) -> Vec<Step> {
-    let mut folded: Vec<Step> = Vec::with_capacity(chain.len());
+pub(crate) fn fold_batch_norm(chain: Vec<ChainStep>) -> Vec<ChainStep> {
+    let mut folded: Vec<ChainStep> = Vec::with_capacity(chain.len());
     for step in chain {
         let before = folded.last_mut().map(|step| &mut step.form);
         match (before, &step.form) {
@@ -102,7 +108,7 @@ pub(crate) fn fold_batch_norm(chain: Vec<Step>) -> Vec<Step> {
                 Some(ExportForm::Conv { weight, bias, .. } | ExportForm::Dense { weight, bias }),
                 ExportForm::BatchNorm { gamma, beta, mean, variance, epsilon },
             ) => {
-                let Affine { scale, shift } = scale_and_shift(gamma, beta, mean, variance, *epsilon);
+                let ChannelAffine { scale, shift } = scale_and_shift(gamma, beta, mean, variance, *epsilon);
                 let row = weight.len() / bias.len();
                 for (row, scale) in weight.chunks_exact_mut(row).zip(&scale) {
                     row.iter_mut().for_each(|w| *w = (f64::from(*w) * scale) as f32);
@@ -182,7 +188,7 @@ mod tests {
             epsilon: 0.25,
         };
         let shape = Shape::vector(1);
-        let step = |form| Step { name: String::new(), input: shape, output: shape, form };
+        let step = |form| ChainStep { name: String::new(), input: shape, output: shape, form };
         let dense = ExportForm::Dense { weight: vec![4.0], bias: vec![1.0] };
         // (4 x + 1 − 2) · 3 / 2 + 0.5
         let expected = ExportForm::Dense { weight: vec![6.0], bias: vec![-1.0] };

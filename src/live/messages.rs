@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::coverage::Shares;
 use crate::report::charts::map;
-use crate::report::charts::palette::heat_hex;
+use crate::report::charts::palette::{self, heat_hex};
 use crate::simulator::car::dynamics::MAX_STEER_DEG;
 use crate::simulator::car::expert::pursuit;
 use crate::simulator::car::speed::telemetry_mph;
@@ -72,10 +72,14 @@ pub struct Hello {
     pub edges: Vec<Vec<[f64; 2]>>,
     /// Wheel angle at steering 1, deg.
     pub full_lock_deg: f64,
-    /// Colours of the trail by its distance from the line, from 0 to `darkest_m`.
+    /// Colours of the trail by its distance from the line, from 0 to the range that covers it.
     pub heat: Vec<String>,
-    /// Distance from the line of the last colour, m.
-    pub darkest_m: f64,
+    /// Distances from the line that may have the last colour, m.
+    pub ranges_m: [f64; 5],
+    /// Colours of the model, or of who drives, and of the expert.
+    pub palette: [&'static str; 2],
+    /// Colours that saliency adds, from nothing to most.
+    pub saliency: Vec<String>,
 }
 
 impl Hello {
@@ -90,7 +94,9 @@ impl Hello {
             edges: map::edges(track),
             full_lock_deg: MAX_STEER_DEG,
             heat: (0..map::COLOURS).map(|step| heat_hex(map::step_share(step))).collect(),
-            darkest_m: map::DARKEST_M,
+            ranges_m: map::RANGES_M,
+            palette: [palette::MODEL, palette::REFERENCE],
+            saliency: (0..=8).map(|k| palette::saliency_hex(f64::from(k) / 8.0)).collect(),
         }
     }
 }

@@ -10,17 +10,16 @@ use crate::pilot::Pilot;
 use crate::simulator::recorder::expert_drive::drive_and_label;
 use crate::simulator::recorder::record::write_recording;
 
-/// What the model drives of each take of the training set.
+/// Fraction of each take's laps that the model drives.
 const LAPS: f64 = 0.5;
 
-/// What is driven in `round` (from 1): the plain ones of `takes`, shorter, with other starts and light.
+/// The takes of `round` (from 1): the plain ones among `takes`, shortened, with new starts and light.
 fn takes_of_round(takes: &[Take], round: u32) -> Vec<Take> {
     let plain = takes.iter().filter(|take| !take.recovery).cloned();
     plain.map(|take| Take { laps: LAPS * take.laps, seed: take.seed + 1000 * u64::from(round), ..take }).collect()
 }
 
-/// Share of the seconds in which the expert itself is at the wheel in `round`: 1/2, 1/4, …; the model's own errors come in
-/// by and by.
+/// Share of the seconds in which the expert drives in `round`: 1/2, 1/4, …. Each round shows more of the model's own errors.
 fn expert_share(round: u32) -> f64 {
     0.5f64.powi(round.min(60) as i32)
 }

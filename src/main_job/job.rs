@@ -20,15 +20,15 @@ use crate::training::{self, RunFolder, TrainRequest, TrainResult, TrainingEvent,
 /// Where the main job keeps what it records.
 pub const RECORDINGS: &str = "data/recordings";
 
-/// What the main job notes in a run folder, so that a run that was stopped goes on to the end of the job.
+/// The state of the main job in a run folder, from which a stopped run goes on to the end of the job.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct JobNote {
-    /// Runs of the finished model on each track.
+    /// Trials of the finished model on each track.
     pub runs: usize,
-    /// Times that the model drives, the expert labels, and training begins anew on all recordings.
+    /// Number of DAgger rounds: the model drives, the expert labels, and training begins anew on all recordings.
     pub dagger_rounds: u32,
-    /// Rounds that lie before this run.
+    /// Number of rounds before this run.
     pub round: u32,
 }
 
@@ -92,7 +92,7 @@ fn observed<T>(
     result.and_then(|value| ended.map(|()| value))
 }
 
-/// Where a job records what, and where it drives.
+/// What a job records and where, and where it drives.
 #[derive(Clone, Debug)]
 pub struct Scope {
     /// Folder of the training sets.
@@ -120,7 +120,7 @@ pub struct Job<'a> {
     folder: Option<PathBuf>,
 }
 
-/// What the first training of a job is asked for.
+/// The request for the first training of a job.
 #[derive(Clone, Debug)]
 pub struct JobRequest {
     /// The experiment.
@@ -138,7 +138,7 @@ pub struct JobRequest {
 }
 
 impl<'a> Job<'a> {
-    /// A job that ends with what `note` says.
+    /// A job that continues from `note`.
     pub fn new(
         scope: Scope,
         note: JobNote,
@@ -260,7 +260,7 @@ impl<'a> Job<'a> {
     }
 }
 
-/// Puts `pilot` to the test on all of `tracks` at once; the results are in their order, trajectories below `keep`. Call it
+/// Tests `pilot` on all of `tracks` at once; the results are in their order, trajectories below `keep`. Call it
 /// inside a rayon pool.
 ///
 /// # Errors

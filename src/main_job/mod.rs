@@ -36,7 +36,7 @@ pub const TRACKS: [&str; 9] = [
 /// Frames of the expert's drive that the offline error is taken over.
 const OFFLINE_FRAMES: usize = 300;
 
-/// How a model does on one track: its drive, and its error on what the expert saw there.
+/// Results of a model on one track: its drive, and its offline error on the expert's frames.
 #[derive(Clone, Debug, Serialize)]
 pub struct TrackResult {
     /// Closed loop.
@@ -46,7 +46,7 @@ pub struct TrackResult {
     pub offline_mae_deg: f64,
 }
 
-/// What the main job came to; `train --json` without a recording prints it.
+/// The result of the main job; `train --json` without a recording prints it.
 #[derive(Clone, Debug, Serialize)]
 pub struct MainJobResult {
     /// The training.
@@ -56,9 +56,9 @@ pub struct MainJobResult {
     pub drives: Vec<TrackResult>,
 }
 
-/// Puts `pilot` to the test on `track`. Call it inside a rayon pool; `observer` is told the share of the runs that are
-/// done. The trajectories are saved in a folder below `keep`, if one is named; what lies there
-/// already from this test before a stop is left.
+/// Tests `pilot` on `track`. Call it inside a rayon pool; `observer` is told the share of the runs that are
+/// done. The trajectories are saved in a folder below `keep`, if that is given; a folder that this test left
+/// there before a stop is kept.
 ///
 /// # Errors
 ///
@@ -110,7 +110,7 @@ pub fn offline_mae_deg(pilot: &Pilot, track: &Track, seed: u64) -> Result<f64> {
     Ok(sum / count as f64 * pilot.recipe().full_lock_deg)
 }
 
-/// `count` of the places 0 to `len`, evenly over all of them.
+/// `count` of the indices 0 to `len`, evenly spread.
 fn spread(len: usize, count: usize) -> impl Iterator<Item = usize> {
     (0..count).map(move |k| k * len / count)
 }

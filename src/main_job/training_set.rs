@@ -13,13 +13,13 @@ use crate::simulator::{RecordOptions, Track, record};
 
 /// Random tracks in the set. Variety of looks teaches more than laps: each is driven for a fraction of a lap.
 pub const RANDOM_TRACKS: u64 = 48;
-/// Hash of what the simulator draws and drives. It is part of a set's name, so sets recorded by a simulator that drew or
-/// drove otherwise are not used again. Drawing takes worlds that take long to build, so it is not done at each use: a test
-/// does it and tells the new hash when the simulator has changed.
+/// Hash of the simulator's pictures and drives. It is part of a set's name, so a set is recorded again when the simulator has
+/// changed. Computing it builds several worlds, which takes long, so a test computes it, and prints the new hash when the
+/// simulator has changed.
 const SIMULATOR: &str = "b573136cd99f9047";
-/// Rows for each second: at 20 mph every 1.8 m. Twice the road teaches more than twice the frames.
+/// Rows per second: one every 1.8 m at 20 mph. Twice the road teaches more than twice the frames of the same road.
 const HZ: u64 = 5;
-/// Seed of the first recording; far from those that drives begin with, so that starts and light are others.
+/// Seed of the first recording; far from the seeds of drives, so that starts and light differ.
 const FIRST_SEED: u64 = 101;
 
 /// One recording of the set.
@@ -80,7 +80,7 @@ pub fn takes() -> Vec<Take> {
     takes
 }
 
-/// What a set is made from, as text: a set with the same text has the same pictures.
+/// Everything that determines a set, as text: the same text gives the same pictures.
 fn settings(takes: &[Take]) -> Result<String> {
     #[derive(Serialize)]
     struct Settings<'a> {

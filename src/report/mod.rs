@@ -6,4 +6,5 @@
 pub mod charts;
 pub mod explain;
 pub mod pages;
+pub mod tone;
 pub mod video;

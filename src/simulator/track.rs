@@ -84,7 +84,7 @@ impl Track {
         Road::from_spec(spec, place).map(Track::new)
     }
 
-    /// Whether training must not see this track.
+    /// Whether the track is held out of training.
     pub fn held_out(&self) -> bool {
         self.spec.held_out
     }

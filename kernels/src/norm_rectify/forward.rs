@@ -1,6 +1,7 @@
-//! The pass forward.
+//! The forward pass.
 
-use super::{EACH, ONE, RectifyShape, Slopes, ZERO, get_windows, largest, prefetch_windows, rectified};
+use super::operands::{RectifyShape, Slopes};
+use super::windows::{EACH, ONE, ZERO, get_windows, largest, prefetch_windows, rectified};
 use crate::simd::{Simd, get_first, put_first};
 
 per_isa! {
@@ -33,13 +34,13 @@ per_isa! {
     }
 }
 
-/// What is the same for a whole channel.
+/// The numbers of a channel.
 #[derive(Clone, Copy)]
 struct Line {
     /// `z = x scale + shift`.
     scale: f32,
     shift: f32,
-    /// The slope, where there is one for all.
+    /// The slope, if the channel has a single one.
     slope: f32,
 }
 
@@ -134,7 +135,7 @@ impl Line {
             *z = simd.mul_add(*z, scale, shift);
         }
         let slopes = if SLOPES == EACH { get_windows(simd, slopes, at, count) } else { [simd.splat(self.slope); 4] };
-        let (_, most) = largest::<S, SLOPES>(simd, z, slopes);
-        put_first(simd, y, at, simd.to_memory_order(most), count);
+        let (_, max) = largest::<S, SLOPES>(simd, z, slopes);
+        put_first(simd, y, at, simd.to_memory_order(max), count);
     }
 }

@@ -51,6 +51,8 @@ const CASES: &[Case] = &[
     ([64, 62, 70, 8], [3, 3], [1, 1], [0; 4]),
     ([3, 37, 60, 8], [5, 5], [2, 2], [0; 4]),
     ([6, 2, 100, 8], [3, 3], [1, 1], [0, 2, 0, 0]),
+    // One output and many channels: the weight gradient as a matrix product.
+    ([5, 3, 3, 40], [3, 3], [1, 1], [0; 4]),
     // A 1x1 kernel, whose columns are the image itself.
     ([6, 5, 7, 9], [1, 1], [1, 1], [0; 4]),
     // A kernel that does not fit: no output.

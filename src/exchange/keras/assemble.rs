@@ -9,7 +9,7 @@ use super::architecture::KerasLayer;
 use super::file::Tensor;
 use super::limits::check_size;
 use super::messages::{Problem, shown};
-use super::translate::{AxisOrder, KernelLayout, Operation, Step};
+use super::translate::{AxisOrder, KerasStep, KernelLayout, Operation};
 use crate::engine::layers::{
     AveragePoolSpec, BatchNormSpec, Conv2dSpec, DenseSpec, FlattenSpec, MaxPoolSpec, PReluSpec, Padding,
     ReceptiveField, Slopes,
@@ -47,7 +47,7 @@ pub(super) struct Context {
 pub(super) fn assemble(
     context: &Context,
     layers: &[KerasLayer],
-    steps: &[Step],
+    steps: &[KerasStep],
     tensors: &[Vec<Tensor>],
 ) -> Result<Assembly, Problem> {
     let mut assembler = Assembler {
@@ -82,7 +82,7 @@ struct Assembler<'a> {
 }
 
 impl Assembler<'_> {
-    fn step(&mut self, step: &Step, tensors: &[Tensor]) -> Result<(), String> {
+    fn step(&mut self, step: &KerasStep, tensors: &[Tensor]) -> Result<(), String> {
         match &step.operation {
             Operation::Nothing | Operation::Input => {}
             Operation::Plain(spec) => {

@@ -12,13 +12,13 @@ use super::marshal::{self, Layout, Object};
 
 /// `x · factor + offset`.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Affine {
+pub(super) struct LambdaAffine {
     pub factor: f64,
     pub offset: f64,
 }
 
 /// The function in the configuration of a `Lambda` layer, or why it cannot be told.
-pub(super) fn function(config: &serde_json::Map<String, Value>) -> Result<Affine, String> {
+pub(super) fn function(config: &serde_json::Map<String, Value>) -> Result<LambdaAffine, String> {
     let has_extras = |value: Option<&Value>| {
         value.is_some_and(|value| match value {
             Value::Null => false,
@@ -65,7 +65,7 @@ fn code_bytes(text: &str) -> Vec<u8> {
 }
 
 /// The function that the marshalled code computes, if it is of that form.
-pub(super) fn affine(code: &[u8]) -> Option<Affine> {
+pub(super) fn affine(code: &[u8]) -> Option<LambdaAffine> {
     Layout::ALL.into_iter().find_map(|layout| {
         let object = marshal::code(code, layout)?;
         let Object::Code(code) = &*object else { return None };
@@ -179,14 +179,14 @@ impl Dialect {
 #[derive(Clone, Copy, Debug)]
 enum Symbol {
     Number { value: f64, whole: bool },
-    Expression(Affine),
+    Expression(LambdaAffine),
 }
 
 /// x itself.
-const ARGUMENT: Symbol = Symbol::Expression(Affine { factor: 1.0, offset: 0.0 });
+const ARGUMENT: Symbol = Symbol::Expression(LambdaAffine { factor: 1.0, offset: 0.0 });
 
 /// Follows the instructions; `None` if they compute anything but one expression in x.
-fn run(instructions: &[Instruction], constants: &[std::rc::Rc<Object>]) -> Option<Affine> {
+fn run(instructions: &[Instruction], constants: &[std::rc::Rc<Object>]) -> Option<LambdaAffine> {
     let mut stack = Vec::new();
     for (place, instruction) in instructions.iter().enumerate() {
         let symbol = match *instruction {
@@ -219,8 +219,8 @@ fn run(instructions: &[Instruction], constants: &[std::rc::Rc<Object>]) -> Optio
 fn scaled(symbol: Symbol, by: f64) -> Symbol {
     match symbol {
         Symbol::Number { value, whole } => Symbol::Number { value: value * by, whole },
-        Symbol::Expression(Affine { factor, offset }) => {
-            Symbol::Expression(Affine { factor: factor * by, offset: offset * by })
+        Symbol::Expression(LambdaAffine { factor, offset }) => {
+            Symbol::Expression(LambdaAffine { factor: factor * by, offset: offset * by })
         }
     }
 }
@@ -231,10 +231,10 @@ fn combined(instruction: Instruction, left: Symbol, right: Symbol) -> Option<Sym
     let sum = |left: Symbol, right: Symbol| match (left, right) {
         (Number { value: a, whole: x }, Number { value: b, whole: y }) => Number { value: a + b, whole: x && y },
         (Number { value, .. }, Expression(a)) | (Expression(a), Number { value, .. }) => {
-            Expression(Affine { offset: a.offset + value, ..a })
+            Expression(LambdaAffine { offset: a.offset + value, ..a })
         }
         (Expression(a), Expression(b)) => {
-            Expression(Affine { factor: a.factor + b.factor, offset: a.offset + b.offset })
+            Expression(LambdaAffine { factor: a.factor + b.factor, offset: a.offset + b.offset })
         }
     };
     Some(match (instruction, left, right) {
@@ -253,7 +253,7 @@ fn combined(instruction: Instruction, left: Symbol, right: Symbol) -> Option<Sym
             Number { value: a / b, whole: false }
         }
         (Instruction::Divide | Instruction::DivideWhole, Expression(a), Number { value, .. }) => {
-            Expression(Affine { factor: a.factor / value, offset: a.offset / value })
+            Expression(LambdaAffine { factor: a.factor / value, offset: a.offset / value })
         }
         _ => return None,
     })
@@ -317,7 +317,7 @@ mod tests {
     #[test]
     fn both_ways_of_writing_code_are_read() {
         let (_, code) = cases().remove(0);
-        let expected = Affine { factor: 1.0 / 127.5, offset: -1.0 };
+        let expected = LambdaAffine { factor: 1.0 / 127.5, offset: -1.0 };
         let characters: String = code.iter().map(|byte| char::from(*byte)).collect();
         let keras1 = json!({"function": [characters, null, null], "arguments": {}});
         let mut lines = STANDARD.encode(&code);

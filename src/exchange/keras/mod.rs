@@ -24,10 +24,10 @@ use steersman_kernels::Isa;
 
 use self::assemble::{Assembly, Context};
 use self::file::KerasFile;
-use self::lambda::Affine;
+use self::lambda::LambdaAffine;
 use self::limits::{MAX_JSON_BYTES, check_size};
 use self::messages::{Problem, listed, shown};
-use self::translate::{AxisOrder, Operation, Step};
+use self::translate::{AxisOrder, KerasStep, Operation};
 use crate::dataset::preprocess::Preprocessing;
 use crate::engine::network::{LayerSpec, Network, Parameters};
 use crate::engine::tensor::Shape;
@@ -148,7 +148,7 @@ pub fn import(path: &Path, options: &ImportOptions) -> Result<Imported> {
     let mut steps = Vec::new();
     for layer in &chain.layers {
         unknown.remove(&layer.name);
-        let known = options.lambdas.get(&layer.name).map(|(a, b)| Affine { factor: 1.0 / a, offset: -b });
+        let known = options.lambdas.get(&layer.name).map(|(a, b)| LambdaAffine { factor: 1.0 / a, offset: -b });
         match translate::translate(layer, known) {
             Ok(step) => steps.push(step),
             Err(reason) if problems.iter().all(|problem| problem.layer != layer.name) => {
@@ -207,9 +207,9 @@ fn read_architecture(path: &Path) -> Result<String> {
 }
 
 /// The order of axes that all layers of the chain agree on.
-fn axis_order(layers: &[architecture::KerasLayer], steps: &[Step], problems: &mut Vec<Problem>) -> AxisOrder {
+fn axis_order(layers: &[architecture::KerasLayer], steps: &[KerasStep], problems: &mut Vec<Problem>) -> AxisOrder {
     // Flatten has an order of its own.
-    let says = |step: &Step| step.order.filter(|_| step.operation != Operation::Flatten);
+    let says = |step: &KerasStep| step.order.filter(|_| step.operation != Operation::Flatten);
     let order = steps.iter().find_map(says).unwrap_or(AxisOrder::ChannelsLast);
     if layers.len() == steps.len() {
         for (layer, _) in layers.iter().zip(steps).filter(|(_, step)| says(step).is_some_and(|own| own != order)) {
@@ -220,7 +220,7 @@ fn axis_order(layers: &[architecture::KerasLayer], steps: &[Step], problems: &mu
 }
 
 /// Shape of the input: what the file says, or else what the user's preprocessing gives.
-fn input_shape(steps: &[Step], order: AxisOrder, given: Option<Shape>) -> Result<Shape, String> {
+fn input_shape(steps: &[KerasStep], order: AxisOrder, given: Option<Shape>) -> Result<Shape, String> {
     let said = steps.iter().find_map(|step| step.input.as_ref());
     let shape = match said.map(Vec::as_slice) {
         Some(&[a, b, c]) if a > 0 && b > 0 && c > 0 => match order {

@@ -3,7 +3,7 @@
 use serde_json::{Map, Value};
 
 use super::architecture::KerasLayer;
-use super::lambda::{self, Affine};
+use super::lambda::{self, LambdaAffine};
 use super::messages::shown;
 use crate::engine::layers::{
     BatchNormSpec, Conv2dSpec, CropSpec, DropoutSpec, EluSpec, LeakyReluSpec, Padding, ReluSpec, ScaleSpec,
@@ -79,7 +79,7 @@ impl Operation {
 
 /// A translated layer.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Step {
+pub(super) struct KerasStep {
     pub operation: Operation,
     /// What follows, without weights.
     pub activation: Option<LayerSpec>,
@@ -96,14 +96,14 @@ pub(super) struct Step {
 /// # Errors
 ///
 /// Why it has no counterpart.
-pub(super) fn translate(layer: &KerasLayer, known: Option<Affine>) -> Result<Step, String> {
+pub(super) fn translate(layer: &KerasLayer, known: Option<LambdaAffine>) -> Result<KerasStep, String> {
     let options = Options(&layer.config);
     let mut notice = None;
     let mut activation = None;
     let operation = match layer.class.as_str() {
         "InputLayer" => Operation::Input,
         "Lambda" => {
-            let Affine { factor, offset } = match known {
+            let LambdaAffine { factor, offset } = match known {
                 Some(known) => known,
                 None => lambda::function(&layer.config).map_err(|reason| {
                     format!("{reason}; if it is x / A - B, say so with --lambda {}=A,B", layer.name)
@@ -178,7 +178,7 @@ pub(super) fn translate(layer: &KerasLayer, known: Option<Affine>) -> Result<Ste
             None => return Err(without_counterpart(class).into()),
         },
     };
-    Ok(Step { operation, activation, order: options.order()?, input: options.input()?, notice })
+    Ok(KerasStep { operation, activation, order: options.order()?, input: options.input()?, notice })
 }
 
 /// Why a class cannot be imported.
@@ -404,7 +404,7 @@ mod tests {
         KerasLayer { name: "l".into(), class: class.into(), config: config.as_object().unwrap().clone() }
     }
 
-    fn step(class: &str, config: Value) -> Step {
+    fn step(class: &str, config: Value) -> KerasStep {
         translate(&layer(class, config), None).unwrap()
     }
 
@@ -463,7 +463,7 @@ mod tests {
 
     #[test]
     fn the_user_can_say_what_a_lambda_computes() {
-        let known = Some(Affine { factor: 0.5, offset: -1.0 });
+        let known = Some(LambdaAffine { factor: 0.5, offset: -1.0 });
         let step = translate(&layer("Lambda", json!({"function": "normalise"})), known).unwrap();
         assert_eq!(step.operation, Operation::Plain(ScaleSpec { factor: 0.5, offset: -1.0 }.into()));
     }

@@ -15,7 +15,7 @@ use steersman_kernels::Isa;
 
 use self::graph::{GraphBuilder, float, int, ints};
 use self::proto::{DataType, ModelProto, OperatorSetIdProto, StringStringEntryProto};
-use super::chain::{Step, chain, check_finite, fold_batch_norm};
+use super::chain::{ChainStep, chain, check_finite, fold_batch_norm};
 use crate::engine::layers::{ExportForm, Formula, Function};
 use crate::error::{Error, Result};
 use crate::model_file::{LABEL, Model};
@@ -86,7 +86,7 @@ pub fn onnx(model: &Model, options: OnnxOptions) -> Result<Vec<u8>> {
     Ok(model.encode_to_vec())
 }
 
-fn check_size(steps: &[Step]) -> Result<()> {
+fn check_size(steps: &[ChainStep]) -> Result<()> {
     let mut bytes = 0;
     for step in steps {
         bytes += 4 * step.weight_len();
@@ -99,7 +99,7 @@ fn check_size(steps: &[Step]) -> Result<()> {
 }
 
 /// Adds the nodes of the network, which reads `input`, `[N, c, h, w]`, and gives `output`, `[N, 1]`.
-fn network(graph: &mut GraphBuilder, steps: &[Step], input: &str, output: &str) {
+fn network(graph: &mut GraphBuilder, steps: &[ChainStep], input: &str, output: &str) {
     let mut value = input.to_string();
     // A vector is [N, c] in ONNX, and [N, c, 1, 1] for the layers of maps.
     let mut is_map = true;
@@ -137,8 +137,8 @@ fn network(graph: &mut GraphBuilder, steps: &[Step], input: &str, output: &str) 
 }
 
 /// Adds the nodes of one step; the name of its result.
-fn operation(graph: &mut GraphBuilder, step: &Step, x: &str, is_map: bool) -> String {
-    let Step { name, input, output, form } = step;
+fn operation(graph: &mut GraphBuilder, step: &ChainStep, x: &str, is_map: bool) -> String {
+    let ChainStep { name, input, output, form } = step;
     let constant = |what: &str| format!("{name}.{what}");
     match form {
         ExportForm::Conv { kernel, stride, pads, weight, bias } => {

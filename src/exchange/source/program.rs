@@ -6,7 +6,7 @@ use crate::dataset::colour::{Colour, HSV, L_SCALE, L_SHIFT, LAB};
 use crate::dataset::resize::{AreaTaps, LinearTap, Method, Resizer};
 use crate::engine::layers::{ExportForm, Formula, Function};
 use crate::engine::tensor::Shape;
-use crate::exchange::chain::{Affine, Step, scale_and_shift};
+use crate::exchange::chain::{ChainStep, ChannelAffine, scale_and_shift};
 use crate::recipe::Recipe;
 
 /// Everything that the file of a model says.
@@ -148,7 +148,7 @@ pub fn expression(formula: &Formula, x: &str, number: fn(f32) -> String) -> Stri
 }
 
 impl<'a> Program<'a> {
-    pub fn new(recipe: &'a Recipe, steps: &[Step]) -> Program<'a> {
+    pub fn new(recipe: &'a Recipe, steps: &[ChainStep]) -> Program<'a> {
         let mut program = Program {
             recipe,
             tables: Vec::new(),
@@ -319,8 +319,8 @@ impl<'a> Program<'a> {
         self.call(comment, "to_planes", args);
     }
 
-    fn step(&mut self, step: &Step) {
-        let Step { name, input, output, form } = step;
+    fn step(&mut self, step: &ChainStep) {
+        let ChainStep { name, input, output, form } = step;
         let array = |what: &str| format!("{name}_{what}");
         let change = |program: &Program| Arg::Change(program.result, input.len());
         match form {
@@ -341,7 +341,7 @@ impl<'a> Program<'a> {
                 self.map_call(step, "dense", vec![weight, bias, Arg::Int(input.len()), Arg::Int(output.len())]);
             }
             ExportForm::BatchNorm { gamma, beta, mean, variance, epsilon } => {
-                let Affine { scale, shift } = scale_and_shift(gamma, beta, mean, variance, *epsilon);
+                let ChannelAffine { scale, shift } = scale_and_shift(gamma, beta, mean, variance, *epsilon);
                 let numbers = |values: Vec<f64>| Values::F32(values.into_iter().map(|value| value as f32).collect());
                 let scale = self.array(array("scale"), numbers(scale));
                 let shift = self.array(array("shift"), numbers(shift));
@@ -382,7 +382,7 @@ impl<'a> Program<'a> {
     }
 
     /// A call that reads one float buffer and writes the other.
-    fn map_call(&mut self, step: &Step, function: &'static str, rest: Vec<Arg>) {
+    fn map_call(&mut self, step: &ChainStep, function: &'static str, rest: Vec<Arg>) {
         let (from, to) = (self.result, if self.result == Buffer::A { Buffer::B } else { Buffer::A });
         self.reserve(to, step.output.len());
         let args = [Arg::Read(from, 0), Arg::Write(to, 0)].into_iter().chain(rest).collect();

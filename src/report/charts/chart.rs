@@ -1,18 +1,30 @@
-//! Charts: axes with units, a legend, lines, steps, dots and bars.
+//! Charts: axes with units, a legend, lines, dots and bars.
+//!
+//! A chart is drawn once for wide pages and once for phones, and a chart of positive values with a linear and with a
+//! logarithmic y axis; the page's style shows one of them. Attributes of the drawing tell the page's script which value lies
+//! where, so that it can show values under the pointer.
 
-use crate::report::charts::palette::{GRID, INK, QUIET_INK};
-use crate::report::charts::svg::{Anchor, Svg, text_width};
+use super::palette::{GRID, INK, QUIET_INK};
+use super::svg::{Anchor, Svg, text_width, wrapped};
 
 /// Size of the labels of the ticks, pixels.
 const TICK_SIZE: f64 = 12.0;
 /// Size of axis labels and legend, pixels.
 const LABEL_SIZE: f64 = 13.0;
+/// Size of the title, pixels.
+const TITLE_SIZE: f64 = 15.0;
 /// Room left of the axes.
 const LEFT: f64 = 64.0;
 /// Room right of the axes.
 const RIGHT: f64 = 18.0;
 /// Room below the axes.
 const BELOW: f64 = 44.0;
+/// Width of a drawing for phones, pixels.
+pub(crate) const NARROW: f64 = 358.0;
+/// Height of a chart for phones, pixels.
+const NARROW_HEIGHT: f64 = 300.0;
+/// Decades that a logarithmic axis shows at most; smaller values lie at its border.
+const MAX_DECADES: i32 = 4;
 
 /// How an axis maps values to places.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -72,6 +84,15 @@ struct Series {
     points: Vec<[f64; 2]>,
 }
 
+/// A shaded range of x.
+#[derive(Clone, Debug)]
+struct Shade {
+    from: f64,
+    to: f64,
+    colour: String,
+    name: String,
+}
+
 /// A chart to be drawn.
 #[derive(Clone, Debug)]
 pub struct Chart {
@@ -80,56 +101,99 @@ pub struct Chart {
     x: Axis,
     y: Axis,
     series: Vec<Series>,
-    shaded: Vec<([f64; 2], String)>,
+    shades: Vec<Shade>,
 }
 
 impl Chart {
-    /// An empty chart of `size` (width, height) pixels.
+    /// An empty chart of `size` (width, height) pixels on a wide page.
     pub fn new(title: impl Into<String>, size: [f64; 2], x: Axis, y: Axis) -> Chart {
-        Chart { title: title.into(), size, x, y, series: Vec::new(), shaded: Vec::new() }
+        Chart { title: title.into(), size, x, y, series: Vec::new(), shades: Vec::new() }
     }
 
     /// Adds values. An empty name leaves the series out of the legend. Of long lines only the extremes of each column of
     /// pixels are drawn.
     pub fn add(mut self, name: &str, colour: &str, mark: Mark, points: Vec<[f64; 2]>) -> Chart {
-        let points = match mark {
-            Mark::Line(_) | Mark::Dashed => thin_out(points, self.size[0] as usize),
-            _ => points,
-        };
         self.series.push(Series { name: name.into(), colour: colour.into(), mark, points });
         self
     }
 
-    /// Shades a range of x in `colour`.
-    pub fn shade(mut self, from: f64, to: f64, colour: &str) -> Chart {
-        self.shaded.push(([from, to], colour.into()));
+    /// Shades a range of x in `colour`; the legend explains it by `name`.
+    pub fn shade(mut self, from: f64, to: f64, colour: &str, name: &str) -> Chart {
+        self.shades.push(Shade { from, to, colour: colour.into(), name: name.into() });
         self
     }
 
-    /// The drawing.
+    /// The drawings in one element, for a page.
     pub fn draw(&self) -> String {
-        let mut svg = Svg::new(self.size[0], self.size[1]);
-        self.draw_into(&mut svg);
+        let mut scales = vec![self.y.scale];
+        if self.can_switch() {
+            scales.push(if self.y.scale == Scale::Log { Scale::Linear } else { Scale::Log });
+        }
+        let mut text = String::from("<figure class=\"chart\">");
+        if let [_, other] = scales[..] {
+            let name = if other == Scale::Log { "logarithmic" } else { "linear" };
+            text += &format!("<label><input type=\"checkbox\"/> {name}</label>");
+        }
+        for (k, scale) in scales.into_iter().enumerate() {
+            let scaled = Chart { y: Axis { scale, ..self.y.clone() }, ..self.clone() };
+            let class = if k == 0 { "own" } else { "other" };
+            text += &format!("<div class=\"{class}\"><div class=\"wide\">{}</div>", scaled.svg(self.size));
+            text += &format!("<div class=\"narrow\">{}</div></div>", scaled.svg([NARROW, NARROW_HEIGHT]));
+        }
+        text + "</figure>\n"
+    }
+
+    /// Whether both kinds of y axis make sense: curves of positive values over a range that is not given.
+    fn can_switch(&self) -> bool {
+        let mut values = self.series.iter().flat_map(|s| &s.points).map(|p| p[1]).filter(|y| y.is_finite()).peekable();
+        let curves = self.series.iter().all(|s| !matches!(s.mark, Mark::Bars { .. }));
+        curves && self.y.range.is_none() && values.peek().is_some() && values.all(|y| y > 0.0)
+    }
+
+    /// The drawing of `size` (width, height) pixels.
+    fn svg(&self, size: [f64; 2]) -> String {
+        let mut svg = Svg::new(size[0], size[1]);
+        self.draw_into(&mut svg, size);
         svg.finish()
     }
 
-    fn draw_into(&self, svg: &mut Svg) {
-        let [width, height] = self.size;
-        svg.text([LEFT, 20.0], 15.0, Anchor::Start, "font-weight=\"600\"", &self.title);
-        svg.text([8.0, 42.0], LABEL_SIZE, Anchor::Start, &fill(QUIET_INK), &self.y.label);
-        let above = self.legend(svg);
+    fn draw_into(&self, svg: &mut Svg, [width, height]: [f64; 2]) {
+        let mut top = 0.0;
+        // The switch of the scale stands right of the title.
+        for line in wrapped(&self.title, TITLE_SIZE, width - LEFT.min(width / 8.0) - 110.0) {
+            top += 20.0;
+            svg.text([8.0, top], TITLE_SIZE, Anchor::Start, "font-weight=\"600\"", &line);
+        }
+        top = top.max(20.0) + 22.0;
+        svg.text([8.0, top], LABEL_SIZE, Anchor::Start, &fill(QUIET_INK), &self.y.label);
+        let above = self.legend(svg, width, top);
         let area = Area { left: LEFT, right: width - RIGHT, top: above, bottom: height - BELOW };
-        let bars = self.series.iter().any(|series| matches!(series.mark, Mark::Bars { .. }));
+        let series: Vec<Series> = self
+            .series
+            .iter()
+            .map(|series| match series.mark {
+                Mark::Line(_) | Mark::Dashed => {
+                    Series { points: thin_out(series.points.clone(), width as usize), ..series.clone() }
+                }
+                _ => series.clone(),
+            })
+            .collect();
+        let bars = series.iter().any(|series| matches!(series.mark, Mark::Bars { .. }));
         let margin = |series: &Series| if let Mark::Bars { width } = series.mark { width / 2.0 } else { 0.0 };
-        let xs = self.series.iter().flat_map(|s| {
+        let xs = series.iter().flat_map(|s| {
             let margin = margin(s);
             s.points.iter().flat_map(move |p| [p[0] - margin, p[0] + margin])
         });
-        let ys = self.series.iter().flat_map(|s| s.points.iter().map(|p| p[1])).chain(bars.then_some(0.0));
-        let x = Map::new(&self.x, xs, [area.left, area.right], false);
-        let y = Map::new(&self.y, ys, [area.bottom, area.top], true);
+        let ys = series.iter().flat_map(|s| s.points.iter().map(|p| p[1])).chain(bars.then_some(0.0));
+        let x = PixelMap::new(&self.x, xs, [area.left, area.right], false);
+        let y = PixelMap::new(&self.y, ys, [area.bottom, area.top], true);
+        for (name, map, label) in [("data-x", &x, &self.x.label), ("data-y", &y, &self.y.label)] {
+            let [from, to] = map.pixels;
+            svg.attribute(name, &format!("{} {} {from} {to} {}", map.low, map.high, u8::from(map.scale == Scale::Log)));
+            svg.attribute(&format!("{name}-label"), label);
+        }
 
-        for ([from, to], colour) in &self.shaded {
+        for Shade { from, to, colour, .. } in &self.shades {
             let (left, right) = (x.place(*from), x.place(*to));
             svg.rect([left, area.top], [(right - left).max(1.0), area.bottom - area.top], &fill(colour));
         }
@@ -151,63 +215,78 @@ impl Chart {
         }
         let middle = (area.left + area.right) / 2.0;
         svg.text([middle, height - 8.0], LABEL_SIZE, Anchor::Middle, &fill(QUIET_INK), &self.x.label);
-
-        for series in &self.series {
-            let points = series.points.iter().map(|p| [x.place(p[0]), y.place(p[1])]);
-            match series.mark {
-                Mark::Line(width) => {
-                    let points: Vec<_> = points.collect();
-                    svg.polyline(&points, &stroke(&series.colour, width));
-                    if points.len() < 40 {
-                        svg.dots(points, width + 4.0, &series.colour, 1.0);
-                    }
-                }
-                Mark::Dashed => {
-                    let style = format!("{} stroke-dasharray=\"6 4\"", stroke(&series.colour, 1.5));
-                    svg.polyline(&points.collect::<Vec<_>>(), &style);
-                }
-                Mark::Dots(diameter) => svg.dots(points, diameter, &series.colour, 0.45),
-                Mark::Bars { width } => {
-                    let bottom = if y.scale == Scale::Log { area.bottom } else { y.place(0.0) };
-                    for point in series.points.iter().filter(|p| p[1].is_finite() && p[1] != 0.0) {
-                        let (left, right) = (x.place(point[0] - width / 2.0), x.place(point[0] + width / 2.0));
-                        let top = y.place(point[1]);
-                        // A hairline between neighbours; none that is there is too small to be seen.
-                        let high = (bottom - top).abs().max(1.0);
-                        let size = [(right - left - 1.0).max(1.0), high];
-                        svg.rect([left + 0.5, bottom.min(top).min(bottom - 1.0)], size, &fill(&series.colour));
-                    }
-                }
-            }
-        }
+        series.iter().for_each(|series| draw_series(svg, series, &x, &y, area.bottom));
     }
 
-    /// Draws the legend, in as many lines as it needs, and returns where the axes may begin.
-    fn legend(&self, svg: &mut Svg) -> f64 {
-        let named: Vec<&Series> = self.series.iter().filter(|series| !series.name.is_empty()).collect();
-        let from = LEFT.max(text_width(&self.y.label, LABEL_SIZE) + 30.0);
-        let (mut x, mut y) = (from, 42.0);
-        for series in named {
-            let width = 30.0 + text_width(&series.name, LABEL_SIZE) + 14.0;
-            if x > from && x + width > self.size[0] {
-                (x, y) = (from, y + 19.0);
+    /// Draws the legend, in as many lines as it needs, and returns where the axes may begin. The name of the y axis stands
+    /// before it, on the line at `top`.
+    fn legend(&self, svg: &mut Svg, width: f64, top: f64) -> f64 {
+        let mut entries: Vec<(&str, &str, Option<Mark>)> = Vec::new();
+        for series in self.series.iter().filter(|series| !series.name.is_empty()) {
+            entries.push((&series.name, &series.colour, Some(series.mark)));
+        }
+        for shade in &self.shades {
+            if entries.iter().all(|(name, ..)| *name != shade.name) {
+                entries.push((&shade.name, &shade.colour, None));
             }
-            match series.mark {
-                Mark::Line(_) => svg.line([x, y - 4.5], [x + 22.0, y - 4.5], &stroke(&series.colour, 3.0)),
-                Mark::Dashed => {
-                    let style = format!("{} stroke-dasharray=\"6 4\"", stroke(&series.colour, 2.0));
+        }
+        let (mut x, mut y) = (text_width(&self.y.label, LABEL_SIZE) + 34.0, top);
+        for (name, colour, mark) in entries {
+            let needed = 30.0 + text_width(name, LABEL_SIZE) + 14.0;
+            if x > 8.0 && x + needed > width {
+                (x, y) = (8.0, y + 19.0);
+            }
+            match mark {
+                Some(Mark::Line(_)) => svg.line([x, y - 4.5], [x + 22.0, y - 4.5], &stroke(colour, 3.0)),
+                Some(Mark::Dashed) => {
+                    let style = format!("{} stroke-dasharray=\"6 4\"", stroke(colour, 2.0));
                     svg.line([x, y - 4.5], [x + 22.0, y - 4.5], &style);
                 }
-                Mark::Dots(_) => svg.dots([[x + 12.0, y - 4.5]], 8.0, &series.colour, 1.0),
-                Mark::Bars { .. } => svg.rect([x + 5.0, y - 11.0], [14.0, 12.0], &fill(&series.colour)),
+                Some(Mark::Dots(_)) => svg.dots([[x + 12.0, y - 4.5]], 8.0, colour, ""),
+                Some(Mark::Bars { .. }) | None => svg.rect([x + 5.0, y - 11.0], [14.0, 12.0], &fill(colour)),
             }
-            svg.text([x + 28.0, y], LABEL_SIZE, Anchor::Start, "", &series.name);
-            x += width;
+            svg.text([x + 28.0, y], LABEL_SIZE, Anchor::Start, "", name);
+            x += needed;
         }
         y + 14.0
     }
 }
 
+/// Draws the values of one series; `bottom` is the lower edge of the axes.
+fn draw_series(svg: &mut Svg, series: &Series, x: &PixelMap, y: &PixelMap, bottom: f64) {
+    let points = series.points.iter().map(|p| [x.place(p[0]), y.place(p[1])]);
+    let named = |kind: &str| format!("class=\"{kind}\" data-name=\"{}\"", super::svg::escape(&series.name));
+    match series.mark {
+        Mark::Line(width) => {
+            let points: Vec<_> = points.collect();
+            svg.polyline(&points, &format!("{} {}", stroke(&series.colour, width), named("curve")));
+            if points.len() < 40 {
+                svg.dots(points, width + 4.0, &series.colour, "");
+            }
+        }
+        Mark::Dashed => {
+            let style = format!("{} stroke-dasharray=\"6 4\" {}", stroke(&series.colour, 1.5), named("curve"));
+            svg.polyline(&points.collect::<Vec<_>>(), &style);
+        }
+        Mark::Dots(diameter) => {
+            svg.dots(points, diameter, &series.colour, &format!("stroke-opacity=\"0.45\" {}", named("dots")));
+        }
+        Mark::Bars { width } => {
+            let zero = if y.scale == Scale::Log { bottom } else { y.place(0.0) };
+            for point in series.points.iter().filter(|p| p[1].is_finite() && p[1] != 0.0) {
+                let (left, right) = (x.place(point[0] - width / 2.0), x.place(point[0] + width / 2.0));
+                let top = y.place(point[1]);
+                // A hairline between neighbours; no bar is too small to be seen.
+                let high = (zero - top).abs().max(1.0);
+                let size = [(right - left - 1.0).max(1.0), high];
+                let style = format!("{} {} data-at=\"{} {}\"", fill(&series.colour), named("bar"), point[0], point[1]);
+                svg.rect([left + 0.5, zero.min(top).min(zero - 1.0)], size, &style);
+            }
+        }
+    }
+}
+
+#[derive(Clone, Copy)]
 struct Area {
     left: f64,
     right: f64,
@@ -226,16 +305,16 @@ pub(super) fn stroke(colour: &str, width: f64) -> String {
 }
 
 /// From values to pixels.
-struct Map {
+struct PixelMap {
     scale: Scale,
     low: f64,
     high: f64,
     pixels: [f64; 2],
 }
 
-impl Map {
+impl PixelMap {
     /// Covers `values`; with `round`, to the next ticks.
-    fn new(axis: &Axis, values: impl Iterator<Item = f64>, pixels: [f64; 2], round: bool) -> Map {
+    fn new(axis: &Axis, values: impl Iterator<Item = f64>, pixels: [f64; 2], round: bool) -> PixelMap {
         let positive = axis.scale == Scale::Log;
         let [mut low, mut high] = axis.range.unwrap_or_else(|| {
             values
@@ -246,6 +325,9 @@ impl Map {
             (low, high) = if positive { (0.1, 1.0) } else { (0.0, 1.0) };
         }
         if positive {
+            if axis.range.is_none() {
+                low = low.max(high / 10f64.powi(MAX_DECADES));
+            }
             // A logarithmic axis of less than a factor of 2 says nothing.
             if high / low < 2.0 {
                 let middle = (low * high).sqrt();
@@ -263,7 +345,7 @@ impl Map {
                 (low, high) = ((low / step).floor() * step, (high / step).ceil() * step);
             }
         }
-        Map { scale: axis.scale, low, high, pixels }
+        PixelMap { scale: axis.scale, low, high, pixels }
     }
 
     /// Where `value` lies; values beyond the range at its border. Not a number where there is no place.
@@ -340,7 +422,7 @@ mod tests {
     use super::*;
 
     fn labels(low: f64, high: f64, scale: Scale, count: f64) -> Vec<String> {
-        let map = Map { scale, low, high, pixels: [0.0, 100.0] };
+        let map = PixelMap { scale, low, high, pixels: [0.0, 100.0] };
         map.ticks(count).into_iter().map(|(_, label)| label).collect()
     }
 
@@ -355,11 +437,11 @@ mod tests {
     #[test]
     fn values_lie_where_the_axis_says() {
         let axis = Axis::new("x");
-        let map = Map::new(&axis, [0.0, 10.0].into_iter(), [100.0, 200.0], false);
+        let map = PixelMap::new(&axis, [0.0, 10.0].into_iter(), [100.0, 200.0], false);
         assert_eq!([0.0, 5.0, 10.0, 99.0].map(|v| map.place(v)), [100.0, 150.0, 200.0, 200.0]);
-        let log = Map::new(&axis.log().range(0.01, 1.0), [].into_iter(), [0.0, 100.0], true);
+        let log = PixelMap::new(&axis.log().range(0.01, 1.0), [].into_iter(), [0.0, 100.0], true);
         assert!((log.place(0.1) - 50.0).abs() < 1e-9 && log.place(0.0).is_nan());
-        let rounded = Map::new(&Axis::new("y"), [0.3, 9.4].into_iter(), [0.0, 1.0], true);
+        let rounded = PixelMap::new(&Axis::new("y"), [0.3, 9.4].into_iter(), [0.0, 1.0], true);
         assert_eq!((rounded.low, rounded.high), (0.0, 10.0));
     }
 
@@ -375,6 +457,36 @@ mod tests {
                 assert!(roxmltree::Document::parse(&text).is_ok() && !text.contains("NaN") && !text.contains("inf"));
             }
         }
+    }
+
+    #[test]
+    fn curves_of_positive_values_have_both_scales_and_a_form_for_phones() {
+        let chart = |points: Vec<[f64; 2]>| {
+            Chart::new("t", [552.0, 340.0], Axis::new("epoch"), Axis::new("loss").log())
+                .add("a", "#000000", Mark::Line(2.0), points)
+                .draw()
+        };
+        let text = chart(vec![[1.0, 0.5], [2.0, 0.1]]);
+        assert_eq!((text.matches("<svg").count(), text.matches("> linear</label>").count()), (4, 1));
+        assert_eq!(text.matches("width=\"358\" height=\"300\" viewBox").count(), 2);
+        assert_eq!(chart(vec![[1.0, 0.5], [2.0, 0.0]]).matches("<svg").count(), 2, "a zero has no logarithm");
+    }
+
+    #[test]
+    fn shades_are_explained_once() {
+        let chart = Chart::new("t", [552.0, 340.0], Axis::new("s"), Axis::new("mph"))
+            .add("", "#000000", Mark::Line(2.0), vec![[0.0, -1.0], [9.0, 1.0]])
+            .shade(1.0, 2.0, "#cccccc", "standing")
+            .shade(4.0, 5.0, "#cccccc", "standing");
+        let text = chart.svg([552.0, 340.0]);
+        assert_eq!((text.matches(">standing<").count(), text.matches("#cccccc").count()), (1, 3));
+    }
+
+    #[test]
+    fn a_logarithmic_axis_shows_four_decades_at_most() {
+        let axis = Axis::new("rate").log();
+        let map = PixelMap::new(&axis, [1e-3, 1e-10].into_iter(), [100.0, 0.0], true);
+        assert!(map.low > 1e-8 && map.place(1e-10) == 100.0, "{}", map.low);
     }
 
     #[test]

@@ -1,14 +1,18 @@
-//! A track from above, with the way a car took, coloured by its distance from the line.
+//! A track from above, with the way a car took, coloured by its distance from the line. The colours cover the range of
+//! [`RANGES_M`] that most of the way lies in.
 
+use super::chart::NARROW;
+use super::palette::{INK, QUIET_INK, ROAD, ROAD_EDGE, heat_hex};
 use crate::error::{Error, Result};
 use crate::files::new_folder::NewFolder;
-use crate::report::charts::palette::{INK, QUIET_INK, heat_hex};
 use crate::report::charts::svg::{Anchor, Svg};
 use crate::simulator::trial::outcome::Moment;
 use crate::simulator::{DriveResult, DriveSummary, Track};
 
-/// Distance from the line that has the darkest colour, m.
-pub(crate) const DARKEST_M: f64 = 2.0;
+/// Distances from the line that may have the darkest colour, m.
+pub(crate) const RANGES_M: [f64; 5] = [0.25, 0.5, 1.0, 2.0, 5.0];
+/// Share of the way that lies below the darkest colour.
+const COVERED: f64 = 0.98;
 /// Steps of colour.
 pub(crate) const COLOURS: usize = 8;
 
@@ -45,14 +49,33 @@ pub fn write(track: &Track, result: &DriveResult, folder: &NewFolder) -> Result<
     written.map_err(|source| folder.explain(Error::Io { path, source }))
 }
 
+/// The distance from the line, m, that has the darkest colour where a car was as far from it as `cte_m`: of [`RANGES_M`] the
+/// smallest that covers nearly all of them.
+pub(crate) fn darkest_m(cte_m: impl Iterator<Item = f64>) -> f64 {
+    let mut sorted: Vec<f64> = cte_m.map(f64::abs).filter(|m| m.is_finite()).collect();
+    sorted.sort_by(f64::total_cmp);
+    let covered = sorted.get((COVERED * sorted.len() as f64) as usize).or(sorted.last()).copied().unwrap_or(0.0);
+    RANGES_M.into_iter().find(|range| covered <= *range).unwrap_or(RANGES_M[RANGES_M.len() - 1])
+}
+
+/// As [`draw`], for a page: on wide ground and on a phone. Maps that are to be compared are given the same `darkest_m`.
+pub(crate) fn figure(title: &str, track: Option<&Track>, drives: &[Vec<MapPoint>], darkest_m: f64) -> String {
+    let [wide, narrow] = [[552.0, 430.0], [NARROW, 340.0]].map(|size| draw_at(title, track, drives, size, darkest_m));
+    format!("<figure><div class=\"wide\">{wide}</div><div class=\"narrow\">{narrow}</div></figure>\n")
+}
+
 /// Draws `drives` on `track`, if it is known, within `size` (width, height) pixels.
 pub fn draw(title: &str, track: Option<&Track>, drives: &[Vec<MapPoint>], size: [f64; 2]) -> String {
+    draw_at(title, track, drives, size, darkest_m(drives.iter().flatten().map(|point| point.cte_m)))
+}
+
+fn draw_at(title: &str, track: Option<&Track>, drives: &[Vec<MapPoint>], size: [f64; 2], darkest_m: f64) -> String {
     let mut svg = Svg::new(size[0], size[1]);
     svg.text([14.0, 22.0], 15.0, Anchor::Start, "font-weight=\"600\"", title);
     let edges = track.map(edges).unwrap_or_default();
     let driven = drives.iter().flatten().map(|place| [place.x, place.y]);
     let corners = edges.iter().flatten().copied().chain(driven);
-    let within = [16.0, 36.0, size[0] - 16.0, size[1] - 48.0];
+    let within = [16.0, 36.0, size[0] - 16.0, size[1] - 58.0];
     let Some(projection) = Projection::fitting(corners, within) else {
         svg.text([14.0, 50.0], 13.0, Anchor::Start, "", "nothing was driven");
         return svg.finish();
@@ -61,18 +84,18 @@ pub fn draw(title: &str, track: Option<&Track>, drives: &[Vec<MapPoint>], size: 
 
     if let [outer, inner] = &edges[..] {
         let around: Vec<[f64; 2]> = outer.iter().chain(inner.iter().rev()).map(|p| place(*p)).collect();
-        svg.polygon(&around, "fill=\"#d9d9d9\"");
+        svg.polygon(&around, &format!("fill=\"{ROAD}\""));
         for edge in [outer, inner] {
             svg.polyline(
                 &edge.iter().map(|p| place(*p)).collect::<Vec<_>>(),
-                "stroke=\"#9a9a9a\" stroke-width=\"0.8\"",
+                &format!("stroke=\"{ROAD_EDGE}\" stroke-width=\"0.8\""),
             );
         }
     }
     for drive in drives {
-        way(&mut svg, drive, &place);
+        way(&mut svg, drive, darkest_m, &place);
     }
-    legend(&mut svg, size, &projection);
+    legend(&mut svg, size, darkest_m, &projection);
     svg.finish()
 }
 
@@ -110,8 +133,8 @@ impl Projection {
 }
 
 /// Which of the [`COLOURS`] steps of colour a distance from the line has.
-fn step(cte_m: f64) -> usize {
-    ((cte_m.abs() / DARKEST_M * COLOURS as f64) as usize).min(COLOURS - 1)
+fn step(cte_m: f64, darkest_m: f64) -> usize {
+    ((cte_m.abs() / darkest_m * COLOURS as f64) as usize).min(COLOURS - 1)
 }
 
 /// The place in [`heat`](crate::report::charts::palette::heat) of a step of colour; the lightest would not show on the road.
@@ -120,8 +143,8 @@ pub(crate) fn step_share(step: usize) -> f64 {
 }
 
 /// The place in [`heat`](crate::report::charts::palette::heat) of a distance from the line, m.
-pub(crate) fn share(cte_m: f64) -> f64 {
-    step_share(step(cte_m))
+pub(crate) fn share(cte_m: f64, darkest_m: f64) -> f64 {
+    step_share(step(cte_m, darkest_m))
 }
 
 /// Right and left edge of the road, closed.
@@ -137,15 +160,17 @@ pub(crate) fn edges(track: &Track) -> Vec<Vec<[f64; 2]>> {
 }
 
 /// Draws a way in stretches of one colour.
-fn way(svg: &mut Svg, drive: &[MapPoint], place: &impl Fn([f64; 2]) -> [f64; 2]) {
+fn way(svg: &mut Svg, drive: &[MapPoint], darkest_m: f64, place: &impl Fn([f64; 2]) -> [f64; 2]) {
     let mut from = 0;
     for i in 1..=drive.len() {
-        let ends = i == drive.len() || drive[i].put_back || step(drive[i].cte_m) != step(drive[from].cte_m);
+        let ends = i == drive.len()
+            || drive[i].put_back
+            || step(drive[i].cte_m, darkest_m) != step(drive[from].cte_m, darkest_m);
         if ends {
             // The first point of the next stretch joins them, unless the car was lifted there.
             let joined = usize::from(i < drive.len() && !drive[i].put_back);
             let points: Vec<_> = drive[from..i + joined].iter().map(|p| place([p.x, p.y])).collect();
-            let colour = heat_hex(share(drive[from].cte_m));
+            let colour = heat_hex(share(drive[from].cte_m, darkest_m));
             svg.polyline(&points, &format!("stroke=\"{colour}\" stroke-width=\"2.6\""));
             from = i;
         }
@@ -157,28 +182,23 @@ fn way(svg: &mut Svg, drive: &[MapPoint], place: &impl Fn([f64; 2]) -> [f64; 2])
         svg.line([x - 4.0, y + 4.0], [x + 4.0, y - 4.0], &style);
     }
     if let Some(end) = drive.last() {
-        svg.dots([place([end.x, end.y])], 8.0, INK, 1.0);
+        svg.dots([place([end.x, end.y])], 8.0, INK, "");
     }
 }
 
-fn legend(svg: &mut Svg, [_, height]: [f64; 2], projection: &Projection) {
-    let y = height - 26.0;
+fn legend(svg: &mut Svg, [width, height]: [f64; 2], darkest_m: f64, projection: &Projection) {
+    let y = height - 34.0;
     for i in 0..COLOURS {
         let fill = format!("fill=\"{}\"", heat_hex(step_share(i)));
-        svg.rect([16.0 + 18.0 * i as f64, y - 10.0], [18.0, 10.0], &fill);
+        svg.rect([16.0 + 16.0 * i as f64, y - 10.0], [16.0, 10.0], &fill);
     }
     let quiet = format!("fill=\"{QUIET_INK}\"");
-    svg.text([16.0, y + 14.0], 12.0, Anchor::Start, &quiet, &format!("0 to {DARKEST_M:.0} m and more from the line"));
-    let x = 16.0 + 18.0 * COLOURS as f64 + 24.0;
-    svg.text([x, y], 12.0, Anchor::Start, &quiet, "× put back   • end");
-    let bar_m = projection.bar_m(120.0);
-    let from = x + 150.0;
-    svg.line(
-        [from, y - 3.0],
-        [from + bar_m * projection.scale, y - 3.0],
-        &format!("stroke=\"{INK}\" stroke-width=\"2\""),
-    );
-    svg.text([from, y + 14.0], 12.0, Anchor::Start, &quiet, &format!("{bar_m:.0} m"));
+    let bar_m = projection.bar_m(110.0);
+    let from = width - 16.0 - bar_m * projection.scale;
+    svg.line([from, y - 3.0], [width - 16.0, y - 3.0], &format!("stroke=\"{INK}\" stroke-width=\"2\""));
+    svg.text([width - 16.0, y + 14.0], 12.0, Anchor::End, &quiet, &format!("{bar_m:.0} m"));
+    svg.text([16.0, y + 14.0], 12.0, Anchor::Start, &quiet, &format!("0 to {darkest_m} m and more from the line"));
+    svg.text([16.0, y + 29.0], 12.0, Anchor::Start, &quiet, "× put back   ● end of the run");
 }
 
 #[cfg(test)]
@@ -200,5 +220,14 @@ mod tests {
         assert_eq!(text.matches("<path").count() - 1, 2 + 3, "one more is the dot at the end");
         assert!(text.contains(&heat_hex(0.25)) && text.contains(&heat_hex(1.0)));
         assert!(draw("none", None, &[], [552.0, 420.0]).contains("nothing was driven"));
+    }
+
+    #[test]
+    fn colours_cover_the_distances_that_there_are() {
+        let good = (0..100).map(|i| f64::from(i) / 500.0);
+        assert_eq!((darkest_m(good.clone()), darkest_m(good.map(|m| -8.0 * m))), (0.25, 2.0));
+        // One glitch among a thousand does not make the rest pale.
+        assert_eq!(darkest_m((0..1000).map(|i| if i == 7 { 3.0 } else { 0.1 })), 0.25);
+        assert_eq!((darkest_m([].into_iter()), darkest_m([99.0].into_iter())), (0.25, 5.0));
     }
 }

@@ -2,10 +2,6 @@
 
 use crate::picture::RgbImage;
 
-/// Colour of what a person steers, [`palette::BLUE`](crate::report::charts::palette::BLUE).
-pub const HUMAN: [u8; 3] = [0x00, 0x72, 0xb2];
-/// Colour of what a model steers: [`palette::ORANGE`](crate::report::charts::palette::ORANGE), lighter.
-pub const MODEL: [u8; 3] = [0xff, 0xb0, 0x00];
 /// Steering lines are drawn at this many times the angle of the wheels.
 pub const STEERING_SCALE: f64 = 2.0;
 
@@ -23,13 +19,14 @@ pub fn draw_steering(picture: &mut RgbImage, wheels_deg: f64, rgb: [u8; 3]) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::report::charts::palette::REFERENCE_RGB;
 
     #[test]
     fn a_line_leans_by_twice_the_angle_of_the_wheels() {
         let mut picture = RgbImage::filled(100, 200, [0; 3]);
-        draw_steering(&mut picture, 22.5, HUMAN);
+        draw_steering(&mut picture, 22.5, REFERENCE_RGB);
         // Twice 22.5 degrees: as far to the right as up.
-        assert_eq!(picture.pixel(98 - 20, 100 + 20), HUMAN);
+        assert_eq!(picture.pixel(98 - 20, 100 + 20), REFERENCE_RGB);
         assert_eq!(picture.pixel(98 - 20, 100 - 20), [0; 3]);
     }
 }

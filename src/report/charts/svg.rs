@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use crate::report::charts::palette::INK;
+use super::palette::{GROUND, INK};
 use crate::text::escaped_lines;
 
 /// Fonts every system has one of.
@@ -34,13 +34,20 @@ impl Anchor {
 pub struct Svg {
     width: f64,
     height: f64,
+    attributes: String,
     body: String,
 }
 
 impl Svg {
     /// An empty drawing.
     pub fn new(width: f64, height: f64) -> Svg {
-        Svg { width, height, body: String::new() }
+        Svg { width, height, attributes: String::new(), body: String::new() }
+    }
+
+    /// Gives the whole drawing an attribute.
+    pub fn attribute(&mut self, name: &str, value: &str) {
+        // Writing to a string cannot fail.
+        let _ = write!(self.attributes, " {name}=\"{}\"", escape(value));
     }
 
     /// A rectangle.
@@ -82,7 +89,7 @@ impl Svg {
     }
 
     /// Many dots of one kind, as a single path: 10,000 of them stay small.
-    pub fn dots(&mut self, points: impl IntoIterator<Item = [f64; 2]>, diameter: f64, colour: &str, opacity: f64) {
+    pub fn dots(&mut self, points: impl IntoIterator<Item = [f64; 2]>, diameter: f64, colour: &str, style: &str) {
         let mut path = String::new();
         for [x, y] in points.into_iter().filter(|point| point.iter().all(|v| v.is_finite())) {
             let _ = write!(path, "M{} {}h0", number(x), number(y));
@@ -90,9 +97,8 @@ impl Svg {
         if !path.is_empty() {
             self.put(format_args!(
                 "<path d=\"{path}\" fill=\"none\" stroke=\"{colour}\" stroke-width=\"{}\" stroke-linecap=\"round\" \
-                 stroke-opacity=\"{}\"/>",
-                number(diameter),
-                number(opacity)
+                 {style}/>",
+                number(diameter)
             ));
         }
     }
@@ -111,15 +117,30 @@ impl Svg {
         let (width, height) = (number(self.width), number(self.height));
         format!(
             "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{width}\" height=\"{height}\" viewBox=\"0 0 {width} \
-             {height}\" font-family=\"{FONT}\">\n<rect width=\"{width}\" height=\"{height}\" \
-             fill=\"#ffffff\"/>\n{}</svg>\n",
-            self.body
+             {height}\" font-family=\"{FONT}\"{}>\n<rect width=\"{width}\" height=\"{height}\" \
+             fill=\"{GROUND}\"/>\n{}</svg>\n",
+            self.attributes, self.body
         )
     }
 
     fn put(&mut self, element: std::fmt::Arguments) {
         let _ = writeln!(self.body, "{element}");
     }
+}
+
+/// `text` in lines of at most `width` pixels at `size`, broken between words.
+pub fn wrapped(text: &str, size: f64, width: f64) -> Vec<String> {
+    let mut lines: Vec<String> = Vec::new();
+    for word in text.split_whitespace() {
+        match lines.last_mut() {
+            Some(line) if text_width(line, size) + text_width(word, size) + 0.5 * size <= width => {
+                line.push(' ');
+                line.push_str(word);
+            }
+            _ => lines.push(word.into()),
+        }
+    }
+    lines
 }
 
 /// Width in pixels of `text` at `size`, by the mean width of a letter; good enough to leave room for it.
@@ -171,7 +192,7 @@ mod tests {
     fn a_line_is_broken_where_a_value_is_missing() {
         let mut svg = Svg::new(10.0, 10.0);
         svg.polyline(&[[0.0, 1.0], [1.0, 2.0], [2.0, f64::NAN], [3.0, 4.0]], "");
-        svg.dots([[1.0, 1.0], [f64::NAN, 2.0]], 3.0, "#000000", 0.5);
+        svg.dots([[1.0, 1.0], [f64::NAN, 2.0]], 3.0, "#000000", "");
         let text = svg.finish();
         assert!(text.contains("d=\"M0 1L1 2M3 4\"") && text.contains("d=\"M1 1h0\""), "{text}");
     }

@@ -1,14 +1,15 @@
 //! The pictures of an explanation: saliency, filters, feature maps, and one picture in all its changes.
 
-use super::counterfactual::Change;
-use super::footage::{Footage, Projector};
+use super::change::Change;
+use super::footage::{Footage, FootageBuffers};
 use super::saliency::Saliency;
 use crate::engine::layers::{Family, ReceptiveField};
 use crate::engine::network::NamedLayer;
 use crate::error::Result;
 use crate::picture::RgbImage;
 use crate::pilot::Pilot;
-use crate::report::charts::steering_line::{HUMAN, MODEL, draw_steering};
+use crate::report::charts::palette::{MODEL_RGB, REFERENCE_RGB};
+use crate::report::charts::steering_line::draw_steering;
 
 /// Pictures with saliency.
 const SALIENT: usize = 12;
@@ -45,7 +46,7 @@ pub struct Exhibits {
 ///
 /// As [`Saliency::new`] and [`Footage::picture`].
 pub fn exhibits(pilot: &Pilot, footage: &Footage, steering: &[f32]) -> Result<Exhibits> {
-    let (mut pilot, mut projector, mut image) = (pilot.clone(), Projector::default(), RgbImage::default());
+    let (mut pilot, mut buffers, mut image) = (pilot.clone(), FootageBuffers::default(), RgbImage::default());
     let mut saliency = Saliency::new(pilot.network())?;
     let full_lock_deg = pilot.recipe().full_lock_deg;
     let degrees = |steering: f32| f64::from(steering) * full_lock_deg;
@@ -58,21 +59,21 @@ pub fn exhibits(pilot: &Pilot, footage: &Footage, steering: &[f32]) -> Result<Ex
         (0..count).map(|i| order[((order.len() - 1) as f64 * place(i)).round() as usize]).collect();
     let mut salient = Vec::new();
     for (k, &i) in chosen.iter().enumerate() {
-        footage.picture(i, &mut projector, &mut image)?;
+        footage.picture(i, &mut buffers, &mut image)?;
         let answer = saliency.steer(&mut pilot, image.height, image.width, &image.pixels)?;
         let mut picture = image.clone();
         saliency.overlay(&pilot.recipe().preprocessing, &mut picture);
         let mut caption = format!("{}\nmodel {:+.1}°", footage.name(i), degrees(answer));
         if let Some(label) = footage.label(i) {
-            draw_steering(&mut picture, degrees(label), HUMAN);
+            draw_steering(&mut picture, degrees(label), REFERENCE_RGB);
             caption += &format!(", label {:+.1}°", degrees(label));
         }
-        draw_steering(&mut picture, degrees(answer), MODEL);
+        draw_steering(&mut picture, degrees(answer), MODEL_RGB);
         salient.push(Exhibit { name: format!("saliency_{:02}", k + 1), picture, caption });
     }
     // The hardest steering shows most.
     let hardest = (0..footage.len()).max_by(|&a, &b| steering[a].abs().total_cmp(&steering[b].abs())).unwrap_or(0);
-    footage.picture(hardest, &mut projector, &mut image)?;
+    footage.picture(hardest, &mut buffers, &mut image)?;
     let features = features(&mut pilot, &image)?;
     let mut changes = vec![Exhibit {
         name: "change_none".into(),

@@ -27,7 +27,7 @@ pub enum Footage {
 
 /// The buffers of a thread that takes pictures.
 #[derive(Default)]
-pub struct Projector {
+pub struct FootageBuffers {
     renderer: Renderer,
     frame: RgbFrame,
     jpeg: RoundTrip,
@@ -106,7 +106,7 @@ impl Footage {
     /// # Errors
     ///
     /// [`Error::Io`] and [`Error::Data`] for a file that cannot be read or is no image.
-    pub fn picture(&self, i: usize, projector: &mut Projector, image: &mut RgbImage) -> Result<()> {
+    pub fn picture(&self, i: usize, buffers: &mut FootageBuffers, image: &mut RgbImage) -> Result<()> {
         match self {
             Footage::Files(files) => {
                 let path: &Path = &files[i].0;
@@ -114,7 +114,7 @@ impl Footage {
                 decode_rgb(&bytes, image).map_err(|message| Error::data(path, message))
             }
             Footage::Drive { track, variant, samples } => {
-                let Projector { renderer, frame, jpeg } = projector;
+                let FootageBuffers { renderer, frame, jpeg } = buffers;
                 let view = Camera::new(&samples[i].body, Mount::Center);
                 renderer.render(track.world(), variant, &view, Mount::Center, frame);
                 jpeg.apply(frame)?;

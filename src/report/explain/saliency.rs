@@ -14,15 +14,18 @@ use crate::engine::network::Network;
 use crate::error::{Error, Result};
 use crate::picture::RgbImage;
 use crate::pilot::Pilot;
+use crate::report::charts::palette;
 
 /// Largest share of the overlay's colour.
-const OPACITY: f32 = 0.85;
+const OPACITY: f32 = 0.9;
+/// Grey levels of the picture below the overlay are multiplied by this.
+const DIMMED: f32 = 0.7;
 
 /// Saliency of one picture after the other. All buffers are planned once: a picture allocates nothing.
 #[derive(Clone, Debug)]
 pub struct Saliency {
-    steps: Vec<Step>,
-    means: Vec<Mean>,
+    steps: Vec<BackStep>,
+    means: Vec<ChannelMean>,
     /// Height and width of the network's input.
     size: [usize; 2],
     map: Vec<f32>,
@@ -32,7 +35,7 @@ pub struct Saliency {
 
 /// A layer's feature maps, averaged.
 #[derive(Clone, Debug)]
-struct Mean {
+struct ChannelMean {
     layer: usize,
     channels: usize,
     values: Vec<f32>,
@@ -40,9 +43,9 @@ struct Mean {
 
 /// What is done on the way from the last map to the input, in the order of the layers; gone through backwards.
 #[derive(Clone, Copy, Debug)]
-enum Step {
+enum BackStep {
     /// Through a layer that changes the size.
-    Spread([Axis; 2]),
+    Spread([SpreadAxis; 2]),
     /// Multiply with this mean.
     Multiply(usize),
 }
@@ -50,7 +53,7 @@ enum Step {
 /// How a layer's output relates to its input along one axis: output `i` covers inputs `i * stride - before` and the `kernel`
 /// from there on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Axis {
+pub struct SpreadAxis {
     /// Inputs.
     pub from: usize,
     /// Outputs.
@@ -70,22 +73,31 @@ impl Saliency {
     ///
     /// [`Error::Usage`] if the network has no convolution.
     pub fn new(network: &Network) -> Result<Saliency> {
-        let (mut steps, mut means) = (Vec::new(), Vec::<Mean>::new());
+        let (mut steps, mut means) = (Vec::new(), Vec::<ChannelMean>::new());
         let mut after_convolution = false;
         for (index, named) in network.layers().iter().enumerate() {
             let (input, output) = (named.layer.input(), named.layer.output());
             let axes = |kernel: [usize; 2], stride: [usize; 2], before: [isize; 2]| {
-                let axis =
-                    |k: usize, from, to| Axis { from, to, kernel: kernel[k], stride: stride[k], before: before[k] };
-                Step::Spread([axis(0, input.h, output.h), axis(1, input.w, output.w)])
+                let axis = |k: usize, from, to| SpreadAxis {
+                    from,
+                    to,
+                    kernel: kernel[k],
+                    stride: stride[k],
+                    before: before[k],
+                };
+                BackStep::Spread([axis(0, input.h, output.h), axis(1, input.w, output.w)])
             };
             match named.spec.receptive_field(input) {
                 ReceptiveField::Window { size, stride, before } => {
                     steps.push(axes(size, stride, before));
                     after_convolution = named.spec.family() == Family::Convolution;
                     if after_convolution {
-                        means.push(Mean { layer: index, channels: output.c, values: vec![0.0; output.positions()] });
-                        steps.push(Step::Multiply(means.len() - 1));
+                        means.push(ChannelMean {
+                            layer: index,
+                            channels: output.c,
+                            values: vec![0.0; output.positions()],
+                        });
+                        steps.push(BackStep::Multiply(means.len() - 1));
                     }
                 }
                 // The map counts as it leaves the activation.
@@ -98,14 +110,14 @@ impl Saliency {
             }
         }
         // Beyond the last convolution nothing is multiplied, so nothing needs to be spread.
-        let last = steps.iter().rposition(|step| matches!(step, Step::Multiply(_)));
+        let last = steps.iter().rposition(|step| matches!(step, BackStep::Multiply(_)));
         let last =
             last.ok_or_else(|| Error::Usage("the network has no convolution, so there is no saliency".into()))?;
         steps.truncate(last + 1);
         let input = network.input();
         let sides = steps.iter().filter_map(|step| match step {
-            Step::Spread([down, across]) => Some(down.from.max(down.to) * across.from.max(across.to)),
-            Step::Multiply(_) => None,
+            BackStep::Spread([down, across]) => Some(down.from.max(down.to) * across.from.max(across.to)),
+            BackStep::Multiply(_) => None,
         });
         let largest = sides.max().unwrap_or(0).max(input.positions());
         let room = || Vec::with_capacity(largest);
@@ -142,7 +154,7 @@ impl Saliency {
         self.map.clear();
         for step in self.steps.iter().rev() {
             match step {
-                Step::Multiply(k) => {
+                BackStep::Multiply(k) => {
                     let values = &self.means[*k].values;
                     if self.map.is_empty() {
                         self.map.extend_from_slice(values);
@@ -155,7 +167,7 @@ impl Saliency {
                         self.map.iter_mut().for_each(|value| *value /= most);
                     }
                 }
-                Step::Spread([down, across]) => {
+                BackStep::Spread([down, across]) => {
                     spread(&self.map, *down, *across, &mut self.half_spread, &mut self.spread);
                     std::mem::swap(&mut self.map, &mut self.spread);
                 }
@@ -166,8 +178,9 @@ impl Saliency {
         self.map.iter_mut().for_each(|value| *value = if range > 0.0 { (*value - low) / range } else { 0.0 });
     }
 
-    /// Colours `image`, the camera's picture, where the network was excited: yellow a little, red much. `preprocessing` is the
-    /// network's own. Before the first picture nothing is changed.
+    /// Turns the rows of `image` that the network sees to grey, and colours what excited it as
+    /// [`palette::saliency`](crate::report::charts::palette::saliency) says. Rows that are cut off keep their colours.
+    /// `preprocessing` is the network's own. Before the first picture nothing is changed.
     pub fn overlay(&self, preprocessing: &Preprocessing, image: &mut RgbImage) {
         let ([map_h, map_w], [first, end]) = (self.size, preprocessing.rows);
         if self.map.is_empty() {
@@ -187,16 +200,17 @@ impl Saliency {
                 let upper = at(i, j) * (1.0 - u) + at(i, j + 1) * u;
                 let lower = at(i + 1, j) * (1.0 - u) + at(i + 1, j + 1) * u;
                 let value = upper * (1.0 - t) + lower * t;
-                let (share, colour) = (OPACITY * value, [255.0, 230.0 * (1.0 - value), 0.0]);
-                let below = image.pixel(row, column);
-                let mixed = |k: usize| f32::from(below[k]) * (1.0 - share) + colour[k] * share;
+                let (share, colour) = (OPACITY * value.sqrt(), palette::saliency(f64::from(value)));
+                let [r, g, b] = image.pixel(row, column).map(f32::from);
+                let grey = DIMMED * (0.299 * r + 0.587 * g + 0.114 * b);
+                let mixed = |k: usize| grey * (1.0 - share) + f32::from(colour[k]) * share;
                 image.set_pixel(row, column, std::array::from_fn(|k| mixed(k).round() as u8));
             }
         }
     }
 }
 
-impl Mean {
+impl ChannelMean {
     /// Averages feature maps `[c][h][w]` over the channels; negative values count as 0.
     fn take(&mut self, output: &[f32]) {
         let positions = self.values.len();
@@ -210,7 +224,7 @@ impl Mean {
 
 /// Transposed convolution of `map` with ones: `out[i * stride - before + k] += map[i]` for `k` below the kernel size, first
 /// down into `half`, then across into `out`.
-fn spread(map: &[f32], down: Axis, across: Axis, half: &mut Vec<f32>, out: &mut Vec<f32>) {
+fn spread(map: &[f32], down: SpreadAxis, across: SpreadAxis, half: &mut Vec<f32>, out: &mut Vec<f32>) {
     half.clear();
     half.resize(down.from * across.to, 0.0);
     for i in 0..down.to {
@@ -230,7 +244,7 @@ fn spread(map: &[f32], down: Axis, across: Axis, half: &mut Vec<f32>, out: &mut 
     }
 }
 
-impl Axis {
+impl SpreadAxis {
     /// The inputs that output `i` covers.
     fn covered(self, i: usize) -> std::ops::Range<usize> {
         let begin = (i * self.stride) as isize - self.before;
@@ -247,7 +261,7 @@ mod tests {
     use steersman_kernels::Isa;
 
     /// The definition, written out: sums over all pairs of input and output.
-    fn spread_directly(map: &[f32], down: Axis, across: Axis) -> Vec<f32> {
+    fn spread_directly(map: &[f32], down: SpreadAxis, across: SpreadAxis) -> Vec<f32> {
         let mut out = vec![0.0; down.from * across.from];
         for y in 0..down.from as isize {
             for x in 0..across.from as isize {
@@ -269,7 +283,7 @@ mod tests {
 
     #[test]
     fn spreading_is_the_transposed_convolution_with_ones() {
-        let axis = |from, to, kernel, stride, before| Axis { from, to, kernel, stride, before };
+        let axis = |from, to, kernel, stride, before| SpreadAxis { from, to, kernel, stride, before };
         for (down, across) in [
             (axis(9, 7, 3, 1, 0), axis(11, 4, 5, 2, 0)),
             (axis(8, 4, 3, 2, 0), axis(8, 8, 3, 1, 1)),
@@ -311,7 +325,8 @@ mod tests {
                 .map(|p| (0..channels).map(|c| output[c * positions + p].max(0.0)).sum::<f32>() / channels as f32)
                 .collect()
         };
-        let valid = |from: usize, to: usize, kernel: usize, stride: usize| Axis { from, to, kernel, stride, before: 0 };
+        let valid =
+            |from: usize, to: usize, kernel: usize, stride: usize| SpreadAxis { from, to, kernel, stride, before: 0 };
         let (first, second) = (mean(2, 62 * 62), mean(5, 13 * 13));
         let up = spread_directly(&second, valid(15, 13, 3, 1), valid(15, 13, 3, 1));
         let up = spread_directly(&up, valid(62, 15, 4, 4), valid(62, 15, 4, 4));

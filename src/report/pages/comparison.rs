@@ -1,18 +1,14 @@
 //! Several runs side by side on one page: curves, figures, recipes, and the drives that lie in their folders.
 
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
+use super::drives::{self, DriveView};
+use super::html::Page;
 use crate::error::{Error, Result};
 use crate::recipe::Recipe;
 use crate::report::charts::chart::{Axis, Chart, Mark};
-use crate::report::charts::map::{self, MapPoint};
 use crate::report::charts::palette;
-use crate::report::pages::html::Page;
-use crate::simulator::trial::trajectory::{
-    RUN_DEPTH, Waypoint, find_drives, read_summary, read_trajectory, trajectories,
-};
-use crate::simulator::{DriveSummary, Track};
 use crate::training::{EpochRecord, RunFolder, TrainResult};
 use steersman_kernels::Isa;
 
@@ -31,13 +27,6 @@ pub struct RunView {
     drives: Vec<DriveView>,
 }
 
-/// A drive, as `drive --out` wrote it.
-#[derive(Debug)]
-struct DriveView {
-    summary: DriveSummary,
-    ways: Vec<Vec<MapPoint>>,
-}
-
 /// Reads the runs in `folders`.
 ///
 /// # Errors
@@ -47,16 +36,13 @@ pub fn read(folders: &[PathBuf]) -> Result<Vec<RunView>> {
     let names = names(folders);
     let read = |(path, name): (&PathBuf, String)| {
         let folder = RunFolder::open(path)?;
-        let mut drives: Vec<DriveView> =
-            find_drives(path, RUN_DEPTH).iter().map(|folder| read_drive(folder)).collect::<Result<_>>()?;
-        drives.sort_by(|a, b| a.summary.track.cmp(&b.summary.track));
         Ok(RunView {
             name,
             recipe: folder.recipe()?,
             seed: folder.info()?.seed,
             history: if folder.file("history.csv").is_file() { folder.history()? } else { Vec::new() },
             result: folder.result()?,
-            drives,
+            drives: drives::read(path)?,
         })
     };
     folders.iter().zip(names).map(read).collect()
@@ -68,18 +54,6 @@ fn names(folders: &[PathBuf]) -> Vec<String> {
     let short: Vec<String> = folders.iter().map(last).collect();
     let differ = (1..short.len()).all(|i| !short[..i].contains(&short[i]));
     if differ { short } else { folders.iter().map(|path| path.display().to_string()).collect() }
-}
-
-/// Reads the drive in `folder`.
-fn read_drive(folder: &Path) -> Result<DriveView> {
-    let assisted = trajectories(folder).into_iter().filter(|(kind, ..)| kind == "assisted");
-    let ways = assisted.map(|(_, _, path)| read_way(&path)).collect::<Result<_>>()?;
-    Ok(DriveView { summary: read_summary(folder)?, ways })
-}
-
-fn read_way(path: &Path) -> Result<Vec<MapPoint>> {
-    let place = |w: Waypoint| MapPoint { x: w.x_m, y: w.y_m, cte_m: w.cte_m, put_back: w.intervention > 0 };
-    Ok(read_trajectory(path)?.into_iter().map(place).collect())
 }
 
 /// The page.
@@ -103,7 +77,7 @@ pub fn page(runs: &[RunView]) -> Result<String> {
             keys.into_iter().zip(rows).map(|(key, values)| std::iter::once(key).chain(values).collect()).collect();
         page.table(&headers, &rows);
     }
-    drives(&mut page, runs);
+    describe_drives(&mut page, runs);
     Ok(page.finish())
 }
 
@@ -165,7 +139,7 @@ fn curves(runs: &[RunView]) -> Vec<String> {
         chart("Training loss", loss(), |record| Some(record.train_loss)),
         chart("Validation MSE", loss(), |record| record.val_mse),
         chart("Mean absolute error, centre camera", Axis::new("degrees"), |record| record.val_mae_deg),
-        chart("Learning rate", Axis::new("learning rate").log(), |record| Some(record.learning_rate)),
+        chart("Learning rate", Axis::new("learning rate"), |record| Some(record.learning_rate)),
     ]
     .iter()
     .map(Chart::draw)
@@ -219,7 +193,7 @@ fn flatten(key: &str, value: &toml::Value, entries: &mut BTreeMap<String, String
     }
 }
 
-fn drives(page: &mut Page, runs: &[RunView]) {
+fn describe_drives(page: &mut Page, runs: &[RunView]) {
     page.section("On the road");
     if runs.iter().all(|run| run.drives.is_empty()) {
         page.paragraph(
@@ -227,39 +201,16 @@ fn drives(page: &mut Page, runs: &[RunView]) {
         );
         return;
     }
-    let mut rows = Vec::new();
-    let mut maps = BTreeMap::<String, Vec<String>>::new();
-    for run in runs {
-        for DriveView { summary, ways } in &run.drives {
-            rows.push(vec![
-                format!("{}{}", summary.track, if summary.held_out { " (held out)" } else { "" }),
-                run.name.clone(),
-                format!("{}/{}", summary.laps_completed, summary.laps_total),
-                format!("{:.1} %", summary.autonomy_percent),
-                summary.interventions.to_string(),
-                format!("{:.2} m", summary.cte_mean_m),
-                format!("{:.2} m", summary.cte_p95_m),
-                format!("{:.1} °/s", summary.whiteness_deg_s),
-            ]);
-            // A track file may be gone; the way alone says something as well.
-            let track = Track::load(&summary.track).ok();
-            let title = format!("{}: autonomy {:.0} %", run.name, summary.autonomy_percent);
-            maps.entry(summary.track.clone()).or_default().push(map::draw(
-                &title,
-                track.as_ref(),
-                ways,
-                [552.0, 430.0],
-            ));
-        }
-    }
-    rows.sort();
-    let headers =
-        ["track", "run", "laps", "autonomy", "interventions", "mean distance from line", "95 % below", "whiteness"];
-    page.table(&headers, &rows);
+    let mut all: Vec<(&RunView, &DriveView)> =
+        runs.iter().flat_map(|run| run.drives.iter().map(move |drive| (run, drive))).collect();
+    all.sort_by(|a, b| (a.1.summary.held_out, &a.1.summary.track).cmp(&(b.1.summary.held_out, &b.1.summary.track)));
+    let headers: Vec<&str> = std::iter::once("run").chain(drives::HEADERS).collect();
+    let row = |(run, drive): &(&RunView, &DriveView)| std::iter::once(run.name.clone()).chain(drive.row()).collect();
+    page.table(&headers, &all.iter().map(row).collect::<Vec<_>>());
     page.paragraph("The maps show the assisted runs: the car is put back when it is more than a metre from the line.");
-    for (track, maps) in maps {
-        page.subsection(&track);
-        page.drawings(&maps);
+    for on_track in all.chunk_by(|a, b| a.1.summary.track == b.1.summary.track) {
+        page.subsection(&on_track[0].1.summary.track);
+        page.drawings(&drives::maps(on_track.iter().map(|(run, drive)| (run.name.clone(), *drive))));
     }
 }
 

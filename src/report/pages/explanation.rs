@@ -2,9 +2,11 @@
 
 use super::html::{Figure, Page};
 use crate::pilot::Pilot;
+use crate::report::charts::palette::saliency_hex;
 use crate::report::charts::steering_line::STEERING_SCALE;
 use crate::report::explain::counterfactual::Counterfactuals;
 use crate::report::explain::exhibits::{Exhibit, Exhibits};
+use crate::report::explain::findings::Finding;
 
 /// The table of counterfactuals: a row for each change.
 pub fn table(found: &Counterfactuals) -> (Vec<&'static str>, Vec<Vec<String>>) {
@@ -21,6 +23,12 @@ pub fn table(found: &Counterfactuals) -> (Vec<&'static str>, Vec<Vec<String>>) {
         String::new(),
         format!("it steers by {:.2}° on average", found.spread_deg),
     ]];
+    let straight = optional(found.straight_mae_deg, degrees);
+    if found.straight_mae_deg.is_some() {
+        let dash = || "-".to_string();
+        let what = "for comparison: never steering".to_string();
+        rows.push(vec!["a wheel held straight".into(), dash(), dash(), dash(), dash(), straight, String::new(), what]);
+    }
     rows.extend(found.effects.iter().map(|effect| {
         vec![
             effect.change.text().to_string(),
@@ -29,7 +37,7 @@ pub fn table(found: &Counterfactuals) -> (Vec<&'static str>, Vec<Vec<String>>) {
             format!("{:+.2}°", effect.bias_deg),
             optional(effect.right_way_share, |share| format!("{:.0} %", 100.0 * share)),
             optional(effect.mae_deg, degrees),
-            effect.passed.map_or("", |passed| if passed { "good" } else { "BAD" }).into(),
+            effect.passed.map_or("", |passed| if passed { "good" } else { "bad" }).into(),
             effect.verdict.clone(),
         ]
     }));
@@ -42,8 +50,8 @@ pub fn page(title: &str, pilot: &Pilot, found: &Counterfactuals, exhibits: &Exhi
     let lead = format!("Recipe {}; {} pictures. Angles are those of the front wheels.", recipe.name, found.pictures);
     let mut page = Page::new(title, &lead);
     page.section("What does it look at?");
-    for sentence in &found.verdict {
-        page.advice(sentence, found.effects.iter().all(|effect| effect.passed != Some(false)));
+    for Finding { tone, text } in &found.findings {
+        page.advice(text, *tone);
     }
     page.paragraph(
         "Each picture was changed in one way at a time. \"Moves by\" is the mean distance between the angles before and after; a \
@@ -56,9 +64,11 @@ pub fn page(title: &str, pilot: &Pilot, found: &Counterfactuals, exhibits: &Exhi
     page.figures(4, &figures(&exhibits.changes, true));
     page.section("What excites it");
     page.paragraph(&format!(
-        "VisualBackProp: yellow excites the convolutions a little, red much. From the hardest left to the hardest right. The lines \
-         show the label (blue) and the model (orange), at {STEERING_SCALE} times the angle of the wheels."
+        "VisualBackProp, from the hardest left to the hardest right: what the network sees is grey, and coloured where it excites \
+         the convolutions. The lines show the label (blue) and the model (orange), at {STEERING_SCALE} times the angle of the \
+         wheels."
     ));
+    page.scale("excites a little", "much", &(0..=8).map(|k| saliency_hex(f64::from(k) / 8.0)).collect::<Vec<_>>());
     page.figures(3, &figures(&exhibits.saliency, true));
     page.section("Filters and feature maps");
     page.figures(1, &exhibits.filters.iter().map(|exhibit| figure(exhibit, false)).collect::<Vec<_>>());

@@ -1,36 +1,16 @@
-//! Pages that stand alone: inline drawings, images as `data:` addresses, no script, nothing to load. They are written as
-//! well-formed XML too, so that any XML reader can check them.
+//! Pages that stand alone: inline drawings, images as `data:` addresses, one inline script, nothing to load. They are
+//! written as well-formed XML too, so that any XML reader can check them.
 
 use std::fmt::Write as _;
 
 use crate::report::charts::svg::{FONT, escape};
+use crate::report::charts::{map, palette};
+use crate::report::tone::Tone;
 
-const STYLE: &str = "
-body { margin: 0 auto; padding: 24px 32px 64px; max-width: 1136px; background: #fff; color: #1a1a1a; line-height: 1.5;
-  font-size: 16px; }
-h1 { font-size: 28px; margin: 8px 0 0; overflow-wrap: anywhere; }
-h2 { font-size: 21px; margin: 40px 0 8px; border-bottom: 2px solid #0072B2; padding-bottom: 4px; }
-h3 { font-size: 17px; margin: 24px 0 4px; }
-.lead { color: #5a5a5a; margin: 4px 0 20px; overflow-wrap: anywhere; }
-p { max-width: 860px; margin: 8px 0; }
-table { border-collapse: collapse; margin: 12px 0; font-size: 14px; }
-th { text-align: left; border-bottom: 2px solid #1a1a1a; padding: 4px 14px 4px 0; vertical-align: bottom; }
-td { border-bottom: 1px solid #ddd; padding: 4px 14px 4px 0; vertical-align: top; overflow-wrap: anywhere; }
-td.s { white-space: nowrap; }
-td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; }
-td.n { white-space: nowrap; }
-.row { display: flex; flex-wrap: wrap; gap: 16px; align-items: flex-start; margin: 12px 0; }
-.grid { display: grid; gap: 14px 12px; margin: 12px 0; }
-figure { margin: 0; }
-figcaption { font-size: 13px; color: #3a3a3a; line-height: 1.35; margin-top: 3px; overflow-wrap: anywhere; }
-img { display: block; width: 100%; height: auto; }
-img.pixels { image-rendering: pixelated; }
-svg { display: block; max-width: 100%; height: auto; }
-.advice { background: #fff6e5; border-left: 5px solid #E69F00; padding: 8px 16px; margin: 10px 0; max-width: 860px; }
-.good { background: #e8f6f1; border-left-color: #009E73; }
-pre { background: #f5f5f5; padding: 12px 16px; overflow-x: auto; font-size: 13px; line-height: 1.4; }
-details summary { cursor: pointer; font-weight: 600; margin: 8px 0; }
-";
+/// The style of every page: light or dark as the system is, and usable on a phone.
+const STYLE: &str = include_str!("page.css");
+/// Shows values of charts under the pointer.
+const SCRIPT: &str = include_str!("hover.js");
 
 /// Characters of a table's cell that are not broken.
 const SHORT: usize = 16;
@@ -75,10 +55,21 @@ impl Page {
         self.put(format_args!("<p>{}</p>", escape(text)));
     }
 
-    /// A paragraph that stands out: something to do, or with `good` something to be content with.
-    pub fn advice(&mut self, text: &str, good: bool) {
-        let class = if good { "advice good" } else { "advice" };
+    /// A paragraph that stands out.
+    pub fn advice(&mut self, text: &str, tone: Tone) {
+        let class = match tone {
+            Tone::Warning => "advice",
+            Tone::Good => "advice good",
+            Tone::Neutral => "advice neutral",
+        };
         self.put(format_args!("<div class=\"{class}\">{}</div>", escape(text)));
+    }
+
+    /// What the colours of a scale mean, from `low` to `high`.
+    pub fn scale(&mut self, low: &str, high: &str, colours: &[String]) {
+        let (low, high, colours) = (escape(low), escape(high), colours.join(", "));
+        let style = format!("background: linear-gradient(90deg, {colours})");
+        self.put(format_args!("<p>{low} <span class=\"scale\" style=\"{style}\"></span> {high}</p>"));
     }
 
     /// A table. A column is set to the right if all its cells look like numbers.
@@ -90,8 +81,10 @@ impl Page {
             })
             .collect();
         let class = |column: usize| if numeric.get(column) == Some(&true) { " class=\"n\"" } else { "" };
-        self.body.push_str("<table>");
-        if headers.iter().any(|header| !header.is_empty()) {
+        // On a phone each row of a wide table becomes a card, in which every cell stands behind its header.
+        let titled = headers.iter().any(|header| !header.is_empty());
+        self.body.push_str(if titled { "<table class=\"cards\">" } else { "<table>" });
+        if titled {
             self.body.push_str("<tr>");
             for (column, header) in headers.iter().enumerate() {
                 let _ = write!(self.body, "<th{}>{}</th>", class(column), escape(header));
@@ -104,7 +97,9 @@ impl Page {
                 // Short words stay whole, whatever the width.
                 let short = cell.chars().count() <= SHORT && numeric.get(column) != Some(&true);
                 let class = if short { " class=\"s\"" } else { class(column) };
-                let _ = write!(self.body, "<td{class}>{}</td>", escape(cell));
+                let header = headers.get(column).filter(|header| !header.is_empty());
+                let header = header.map_or(String::new(), |header| format!(" data-header=\"{}\"", escape(header)));
+                let _ = write!(self.body, "<td{class}{header}>{}</td>", escape(cell));
             }
             self.body.push_str("</tr>");
         }
@@ -118,7 +113,7 @@ impl Page {
 
     /// Pictures in `columns` equal columns.
     pub fn figures(&mut self, columns: usize, figures: &[Figure]) {
-        let _ = write!(self.body, "<div class=\"grid\" style=\"grid-template-columns: repeat({columns}, 1fr)\">");
+        let _ = write!(self.body, "<div class=\"grid of{columns}\">");
         for Figure { source, caption, pixelated } in figures {
             let class = if *pixelated { " class=\"pixels\"" } else { "" };
             let alt = escape(&caption.replace('\n', "; "));
@@ -140,10 +135,14 @@ impl Page {
     /// The page.
     pub fn finish(self) -> String {
         let title = escape(&self.title);
+        let shares: Vec<f64> = (0..map::COLOURS).map(map::step_share).collect();
+        let dark = palette::dark_rules(&shares);
         format!(
             "<!DOCTYPE html>\n<html lang=\"en\" xmlns=\"http://www.w3.org/1999/xhtml\">\n<head><meta \
-             charset=\"utf-8\"/><meta name=\"viewport\" content=\"width=device-width\"/><title>{title}</title>\n\
-             <style>{STYLE}body {{ font-family: {FONT}; }}</style></head>\n<body>\n{}</body>\n</html>\n",
+             charset=\"utf-8\"/><meta name=\"viewport\" content=\"width=device-width, initial-scale=1\"/><meta \
+             name=\"color-scheme\" content=\"light dark\"/><title>{title}</title>\n<style>{STYLE}body {{ font-family: \
+             {FONT}; }}\n@media (prefers-color-scheme: dark) {{\n{dark}}}\n</style></head>\n<body>\n{}<script>//<![CDATA[\n\
+             {SCRIPT}//]]></script>\n</body>\n</html>\n",
             self.body
         )
     }
@@ -167,7 +166,7 @@ pub(super) fn assert_stands_alone(text: &str) {
     let document = roxmltree::Document::parse_with_options(text, options).unwrap();
     for node in document.descendants() {
         let name = node.tag_name().name();
-        assert!(!["script", "link", "iframe", "object", "embed"].contains(&name), "<{name}>");
+        assert!(!["link", "iframe", "object", "embed"].contains(&name), "<{name}>");
         for attribute in node.attributes() {
             if ["src", "href", "srcset"].contains(&attribute.name()) {
                 assert!(attribute.value().starts_with("data:"), "{name} loads {}", attribute.value());
@@ -188,11 +187,12 @@ mod tests {
         page.table(&["name", "MAE"], &[vec!["a<b".into(), "1.5 deg".into()], vec!["c".into(), "-".into()]]);
         page.figures(2, &[Figure { source: "data:,".into(), caption: "x\n\"y\"".into(), pixelated: true }]);
         page.folded("recipe", "[a]\nb = '<'");
-        page.advice("do", true);
+        page.advice("do", Tone::Good);
         let text = page.finish();
         assert_stands_alone(&text);
         assert!(
-            text.contains("<td class=\"n\">1.5 deg</td>") && text.contains("<td class=\"s\">a&lt;b</td>"),
+            text.contains("<td class=\"n\" data-header=\"MAE\">1.5 deg</td>")
+                && text.contains("<td class=\"s\" data-header=\"name\">a&lt;b</td>"),
             "{text}"
         );
         assert!(text.contains("x<br/>&quot;y&quot;"));

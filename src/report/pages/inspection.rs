@@ -11,6 +11,7 @@ use crate::report::charts::palette;
 use crate::report::charts::steering::{driven_times, histogram};
 use crate::report::pages::html::{Figure, Page};
 use crate::report::pages::split_view::SplitView;
+use crate::report::tone::Tone;
 
 /// Rows of the sample sheet, worst frames, and frames in all colour spaces, for a page of one recording.
 const SAMPLES: usize = 5;
@@ -53,10 +54,10 @@ pub fn page(inspections: Vec<Inspection>, recipe: &Recipe, seed: u64) -> String 
 fn overview(page: &mut Page, Inspection { report, recording, .. }: &Inspection) {
     page.section("What was found");
     for advice in &report.advice {
-        page.advice(advice, false);
+        page.advice(advice, Tone::Warning);
     }
     if report.advice.is_empty() {
-        page.advice("Nothing to complain of.", true);
+        page.advice("Nothing to complain of.", Tone::Good);
     }
     for notice in &report.notices {
         page.paragraph(&format!("Note: {notice}."));
@@ -104,14 +105,16 @@ fn overview(page: &mut Page, Inspection { report, recording, .. }: &Inspection) 
     page.table(&["", ""], &rows.into_iter().map(Vec::from).collect::<Vec<_>>());
 }
 
+/// Shade of a suspicious stretch, on light ground.
 fn suspicion_colour(what: Suspicion) -> &'static str {
-    match what {
-        Suspicion::Standing => "#dcdcdc",
-        Suspicion::Frozen => "#d6ecf9",
-        Suspicion::FullLock => "#fbe3c0",
-        Suspicion::StuckLabel => "#f3dcea",
-        Suspicion::Contradiction => "#f7cdb6",
-    }
+    let index = match what {
+        Suspicion::Standing => 0,
+        Suspicion::Frozen => 1,
+        Suspicion::FullLock => 2,
+        Suspicion::StuckLabel => 3,
+        Suspicion::Contradiction => 4,
+    };
+    palette::SHADES[index].0
 }
 
 fn labels(page: &mut Page, inspection: &Inspection) {
@@ -139,7 +142,7 @@ fn labels(page: &mut Page, inspection: &Inspection) {
     );
     for stretch in &report.suspicious {
         let (from, to) = (times[stretch.rows.start], times[stretch.rows.end - 1]);
-        chart = chart.shade(from, to, suspicion_colour(stretch.what));
+        chart = chart.shade(from, to, suspicion_colour(stretch.what), stretch.what.text());
     }
     let mut charts = vec![chart.draw()];
     if report.speed_mph.is_some() {
@@ -213,26 +216,34 @@ fn from_left_to_right(recording: &Recording, count: usize) -> Vec<usize> {
     (0..count).map(|i| rows[((rows.len() - 1) as f64 * place(i)).round() as usize]).collect()
 }
 
+/// A label with its sign, which zero has not.
+fn signed(label: f32) -> String {
+    if label == 0.0 { "0".into() } else { format!("{label:+.3}") }
+}
+
 fn camera_figure(image: &RgbImage, caption: String) -> Figure {
     Figure { source: image.jpeg_address(), caption, pixelated: false }
 }
 
 fn samples(page: &mut Page, recording: &Recording, recipe: &Recipe, count: usize) {
     page.section("What the cameras see");
-    let used = match recipe.samples.side_cameras {
-        Some(by) => format!("the recipe adds {by} to the label of the left camera and takes it off that of the right"),
-        None => "the recipe uses the centre camera only".into(),
-    };
-    page.paragraph(&format!("From hard left to hard right; {used}. A mirrored picture has the negated label."));
     let cameras: Vec<View> =
         [View::Left, View::Centre, View::Right].into_iter().filter(|&camera| recording.has(camera)).collect();
+    let used = match recipe.samples.side_cameras {
+        _ if cameras.len() < 2 => String::new(),
+        Some(by) => {
+            format!("; the recipe adds {by} to the label of the left camera and takes it off that of the right")
+        }
+        None => "; the recipe uses the centre camera only".into(),
+    };
+    page.paragraph(&format!("From hard left to hard right{used}. A mirrored picture has the negated label."));
     let mut figures = Vec::new();
     for row in from_left_to_right(recording, count) {
         let (line, steering) = (recording.rows[row].line, recording.rows[row].steering);
         for &camera in &cameras {
             let Some(image) = recording.picture(row, camera) else { continue };
             let label = if recipe.samples.side_cameras.is_some() || camera == View::Centre {
-                format!("{:+.3}", recipe.samples.label(steering, camera))
+                signed(recipe.samples.label(steering, camera))
             } else {
                 "unused".into()
             };
@@ -242,28 +253,32 @@ fn samples(page: &mut Page, recording: &Recording, recipe: &Recipe, count: usize
             {
                 figures.push(camera_figure(
                     &centre.mirrored(),
-                    format!("line {line}, centre mirrored: label {:+.3}", -steering),
+                    format!("line {line}, centre mirrored: label {}", signed(-steering)),
                 ));
             }
         }
     }
-    page.figures(cameras.len() + 1, &figures);
+    // With one camera, two rows of the log stand in each line.
+    page.figures(if cameras.len() == 1 { 4 } else { cameras.len() + 1 }, &figures);
 }
 
 fn colours(page: &mut Page, recording: &Recording, spec: &Preprocessing, count: usize) {
-    page.section("What the network sees");
-    let ([first, end], [height, width]) = (spec.rows, spec.resize);
-    let [source_height, source_width] = spec.source;
-    page.paragraph(&format!(
-        "Rows {first} to {end} of {source_width}x{source_height} pixels, resized to {width}x{height}, in every colour space there is. \
-         The recipe's own is {}.",
-        spec.colour.name()
-    ));
     let mut rows = from_left_to_right(recording, count.max(2));
     rows.truncate(count);
-    for row in rows {
-        let Some(image) = recording.picture(row, View::Centre) else { continue };
-        page.subsection(&format!("Line {}, label {:+.3}", recording.rows[row].line, recording.rows[row].steering));
+    let images: Vec<(usize, RgbImage)> =
+        rows.into_iter().filter_map(|row| Some((row, recording.picture(row, View::Centre)?))).collect();
+    let Some((_, image)) = images.first() else { return };
+    page.section("What the network sees");
+    let ([first, end], [height, width]) = (kept(image, spec), spec.resize);
+    page.paragraph(&format!(
+        "Rows {first} to {end} of {}x{} pixels, resized to {width}x{height}, in every colour space there is. The recipe's own is \
+         {}.",
+        image.width,
+        image.height,
+        spec.colour.name()
+    ));
+    for (row, image) in images {
+        page.subsection(&format!("Line {}, label {}", recording.rows[row].line, signed(recording.rows[row].steering)));
         let mut figures =
             vec![camera_figure(&kept_rows(&image, spec), "the camera's picture; what is kept is not darkened".into())];
         for colour in Colour::ALL {
@@ -283,20 +298,26 @@ fn colours(page: &mut Page, recording: &Recording, spec: &Preprocessing, count: 
     }
 }
 
+/// The rows of `image` that preprocessing keeps, first and end.
+fn kept(image: &RgbImage, spec: &Preprocessing) -> [usize; 2] {
+    spec.rows.map(|row| row * image.height / spec.source[0])
+}
+
 /// The picture with everything that preprocessing cuts off darkened.
 fn kept_rows(image: &RgbImage, spec: &Preprocessing) -> RgbImage {
-    let [first, end] = spec.rows.map(|row| row * image.height / spec.source[0]);
+    let [first, end] = kept(image, spec);
     RgbImage::from_fn(image.height, image.width, |row, column| {
         let pixel = image.pixel(row, column);
         if (first..end).contains(&row) { pixel } else { pixel.map(|level| level / 3) }
     })
 }
 
-/// Up to three planes as grey pictures, beside each other, or wide ones below each other; always with room for three.
+/// Planes as grey pictures: wide ones below each other, others beside each other. A single plane is drawn as large as three.
 fn sheet(planes: &[u8], height: usize, width: usize) -> RgbImage {
     const GAP: usize = 2;
     let below = 2 * width > 3 * height;
-    let [down, across] = if below { [3, 1] } else { [1, 3] };
+    let count = planes.len() / (height * width);
+    let [down, across] = if below { [count, 1] } else { [1, count] };
     let mut sheet = RgbImage::filled(down * (height + GAP) - GAP, across * (width + GAP) - GAP, [255; 3]);
     for (i, plane) in planes.chunks_exact(height * width).enumerate() {
         let (top, left) = if below { (i * (height + GAP), 0) } else { (0, i * (width + GAP)) };
@@ -347,7 +368,7 @@ fn worst(page: &mut Page, inspection: &Inspection, count: usize) {
         .filter_map(|(row, why)| {
             let image = recording.picture(row, View::Centre)?;
             let (line, steering) = (recording.rows[row].line, recording.rows[row].steering);
-            Some(camera_figure(&image, format!("line {line}, label {steering:+.3}\n{why}")))
+            Some(camera_figure(&image, format!("line {line}, label {}\n{why}", signed(steering))))
         })
         .collect();
     page.figures(3, &figures);
@@ -367,7 +388,7 @@ fn training(page: &mut Page, recordings: &[Recording], recipe: &Recipe, seed: u6
             page.drawings(&[before, after]);
         }
         Err(error) => {
-            page.advice(&format!("The recipe {} cannot be trained on this: {error}.", recipe.name), false);
+            page.advice(&format!("The recipe {} cannot be trained on this: {error}.", recipe.name), Tone::Warning);
             page.drawings(&[before]);
         }
     }

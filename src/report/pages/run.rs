@@ -4,6 +4,9 @@ use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
 
+use super::drives;
+use super::html::{Figure, Page};
+use super::split_view::SplitView;
 use crate::dataset::held_out::trained_on_held_out;
 use crate::dataset::{Item, View};
 use crate::engine::network::{Network, group_digits};
@@ -12,11 +15,11 @@ use crate::files::atomic_file;
 use crate::metrics::{Metrics, Prediction};
 use crate::pilot::Pilot;
 use crate::report::charts::chart::{Axis, Chart, Mark};
+use crate::report::charts::palette::{MODEL_RGB, REFERENCE_RGB};
 use crate::report::charts::steering::histogram;
-use crate::report::charts::steering_line::{HUMAN, MODEL, STEERING_SCALE, draw_steering};
+use crate::report::charts::steering_line::{STEERING_SCALE, draw_steering};
 use crate::report::charts::{network_diagram, palette};
-use crate::report::pages::html::{Figure, Page};
-use crate::report::pages::split_view::SplitView;
+use crate::report::tone::Tone;
 use crate::training::{Data, EpochRecord, RunFolder, RunInfo, TrainResult};
 
 /// Worst frames shown.
@@ -55,9 +58,14 @@ fn page(folder: &RunFolder, path: &Path) -> Result<String> {
     let data = Data::prepare(&info.recordings, &recipe, info.seed, 0)?;
     let lead = format!("Recipe {}: {}", recipe.name, recipe.about);
     let mut page = Page::new(&path.display().to_string(), &lead);
+    let drives = drives::read(path)?;
+    if !drives.is_empty() {
+        drives::describe(&mut page, &drives);
+        page.section("Training");
+    }
     match folder.result()? {
-        Some(result) => headline(&mut page, &result),
-        None => page.advice(&unfinished(history.len(), recipe.epochs, path), false),
+        Some(result) => headline(&mut page, &result, drives.is_empty()),
+        None => page.advice(&unfinished(history.len(), recipe.epochs, path), Tone::Warning),
     }
     curves(&mut page, &history);
     let answers = answers(&pilot, &data);
@@ -72,7 +80,7 @@ fn page(folder: &RunFolder, path: &Path) -> Result<String> {
     let title = "Labels of an epoch's training images";
     page.drawings(&[histogram(title, HALF, "images", &view.training_labels)]);
     page.section("Network");
-    page.drawings(&[network_diagram::draw(pilot.network(), &recipe.name)]);
+    page.drawings(&[network_diagram::figure(pilot.network(), &recipe.name)]);
     layer_table(&mut page, pilot.network());
     page.section("How to repeat it");
     environment(&mut page, &info, &history);
@@ -85,22 +93,23 @@ fn unfinished(epochs: usize, of: u32, path: &Path) -> String {
     format!("This run was stopped after {epochs} of {of} epochs; `{go_on}` goes on with it.")
 }
 
-fn headline(page: &mut Page, result: &TrainResult) {
+/// What the training came to; `alone` if nothing was driven yet.
+fn headline(page: &mut Page, result: &TrainResult, alone: bool) {
     let number = |value: Option<f64>, decimals: usize| value.map_or("-".into(), |v| format!("{v:.decimals$}"));
     if let (Some(mae_deg), Some(relative)) = (result.val_mae_deg, result.relative_to_zero) {
         let verdict = if relative < 1.0 { "better than" } else { "no better than" };
         page.advice(
             &format!(
                 "On stretches it has not seen, the model of epoch {} is off by {mae_deg:.2}° of the front wheels on average: \
-                 {relative:.2} of the squared error of a wheel held straight, {verdict} that. Whether it drives, only \
-                 driving shows.",
-                result.best_epoch
+                 {relative:.2} of the squared error of a wheel held straight, {verdict} that.{}",
+                result.best_epoch,
+                if alone { " Whether it drives, only driving shows." } else { "" }
             ),
-            relative < 1.0,
+            if relative < 1.0 { Tone::Good } else { Tone::Warning },
         );
     }
     if !result.trained_on_held_out.is_empty() {
-        page.advice(&format!("The model was {}.", trained_on_held_out(&result.trained_on_held_out)), false);
+        page.advice(&format!("The model was {}.", trained_on_held_out(&result.trained_on_held_out)), Tone::Warning);
     }
     let rows = [
         ["best epoch".to_string(), format!("{} of {}", result.best_epoch, result.epochs)],
@@ -143,8 +152,12 @@ fn learning_curves(history: &[EpochRecord]) -> Vec<String> {
         Mark::Line(2.0),
         of(|record| record.val_mae_deg),
     );
-    let rate = Chart::new("Learning rate at the end of the epoch", HALF, epochs(), Axis::new("learning rate").log())
-        .add("", palette::GREEN, Mark::Line(2.0), of(|record| Some(record.learning_rate)));
+    let rate = Chart::new("Learning rate at the end of the epoch", HALF, epochs(), Axis::new("learning rate")).add(
+        "",
+        palette::GREEN,
+        Mark::Line(2.0),
+        of(|record| Some(record.learning_rate)),
+    );
     let relative = Chart::new("Squared error ÷ that of a wheel held straight", HALF, epochs(), Axis::new("ratio"))
         .add("", palette::BLUE, Mark::Line(2.0), of(|record| record.relative_to_zero))
         .add(
@@ -181,7 +194,7 @@ fn answers(pilot: &Pilot, data: &Data) -> Vec<Answer> {
 }
 
 fn judgement(page: &mut Page, metrics: &Metrics, predictions: &[Prediction], full_lock_deg: f64) {
-    page.section("Predicted against human steering");
+    page.section("Predicted against recorded steering");
     page.paragraph(
         "Validation side, centre camera, the model with the lowest validation error. Angles of the front wheels.",
     );
@@ -190,7 +203,7 @@ fn judgement(page: &mut Page, metrics: &Metrics, predictions: &[Prediction], ful
     let rows = [
         ["frames".to_string(), metrics.rows.to_string()],
         ["mean absolute error".into(), format!("{:.2}°", metrics.mae_deg)],
-        ["where the human steers left".into(), optional(metrics.mae_left_deg, "°")],
+        ["where the driver steers left".into(), optional(metrics.mae_left_deg, "°")],
         ["straight (within 1°)".into(), optional(metrics.mae_straight_deg, "°")],
         ["right".into(), optional(metrics.mae_right_deg, "°")],
         ["bias (+ = too far right)".into(), format!("{:+.2}°", metrics.bias_deg)],
@@ -204,30 +217,30 @@ fn judgement(page: &mut Page, metrics: &Metrics, predictions: &[Prediction], ful
     let scatter = Chart::new(
         "Each frame",
         HALF,
-        Axis::new("human, degrees (+ = right)").range(-reach, reach),
+        Axis::new("recorded, degrees (+ = right)").range(-reach, reach),
         Axis::new("predicted, degrees").range(-reach, reach),
     )
-    .add("", palette::BLUE, Mark::Dots(4.0), points)
-    .add("perfect", palette::VERMILION, Mark::Dashed, vec![[-reach, -reach], [reach, reach]]);
+    .add("", palette::MODEL, Mark::Dots(4.0), points)
+    .add("perfect", palette::REFERENCE, Mark::Dashed, vec![[-reach, -reach], [reach, reach]]);
     let bins = error_by_angle(predictions, full_lock_deg);
     let errors = bins.iter().map(|bin| [bin.centre_deg, bin.mae_deg]).collect();
     let by_angle = Chart::new(
         "Error by angle",
         HALF,
-        Axis::new("human, degrees (+ = right)"),
+        Axis::new("recorded, degrees (+ = right)"),
         Axis::new("mean absolute error, degrees"),
     )
-    .add("", palette::BLUE, Mark::Bars { width: BIN_DEG }, errors)
+    .add("model", palette::MODEL, Mark::Bars { width: BIN_DEG }, errors)
     .add(
-        "predicting zero",
-        palette::VERMILION,
+        "a wheel held straight",
+        palette::INK,
         Mark::Line(1.5),
         bins.iter().map(|b| [b.centre_deg, b.zero_mae_deg]).collect(),
     );
     page.drawings(&[scatter.draw(), by_angle.draw()]);
 
     // Blocks stand one after the other, a second apart.
-    let (mut human, mut model) = (Vec::new(), Vec::new());
+    let (mut recorded, mut model) = (Vec::new(), Vec::new());
     let mut at_s = 0.0;
     for (i, prediction) in predictions.iter().enumerate() {
         if let Some(before) = i.checked_sub(1).map(|i| &predictions[i]) {
@@ -235,21 +248,21 @@ fn judgement(page: &mut Page, metrics: &Metrics, predictions: &[Prediction], ful
             let joined = before.session == prediction.session && (0.0..1.0).contains(&step_s);
             at_s += if joined { step_s } else { 1.0 };
             if !joined {
-                human.push([at_s, f64::NAN]);
+                recorded.push([at_s, f64::NAN]);
                 model.push([at_s, f64::NAN]);
             }
         }
-        human.push([at_s, deg(prediction.label)]);
+        recorded.push([at_s, deg(prediction.label)]);
         model.push([at_s, deg(prediction.steering)]);
     }
     let chart =
         Chart::new("Over time", WIDE, Axis::new("time in the validation blocks, s"), Axis::new("degrees (+ = right)"))
-            .add("human", palette::BLUE, Mark::Line(1.3), human)
-            .add("predicted", palette::VERMILION, Mark::Line(1.3), model);
+            .add("recorded", palette::REFERENCE, Mark::Line(1.3), recorded)
+            .add("predicted", palette::MODEL, Mark::Line(1.3), model);
     page.drawings(&[chart.draw()]);
 }
 
-/// Errors of the frames whose human angle lies in one range.
+/// Errors of the frames whose recorded angle lies in one range.
 #[derive(Debug, PartialEq)]
 struct AngleBin {
     centre_deg: f64,
@@ -279,7 +292,7 @@ fn worst(page: &mut Page, answers: &[Answer], data: &Data, full_lock_deg: f64) {
     page.section("The worst frames");
     page.paragraph(&format!(
         "Validation frames with the largest errors, of frames within {APART} rows of each other only the worst. The lines show \
-         human (blue) and predicted (orange) steering, at {STEERING_SCALE} times the angle of the wheels."
+         recorded (blue) and predicted (orange) steering, at {STEERING_SCALE} times the angle of the wheels."
     ));
     let error = |answer: &Answer| (answer.prediction.steering - answer.prediction.label).abs();
     let mut sorted: Vec<&Answer> = answers.iter().collect();
@@ -299,14 +312,15 @@ fn worst(page: &mut Page, answers: &[Answer], data: &Data, full_lock_deg: f64) {
             let recording = &data.recordings()[usize::from(item.recording)];
             let row = item.row as usize;
             let mut image = recording.picture(row, View::Centre)?;
-            let [human_deg, model_deg] = [prediction.label, prediction.steering].map(|s| f64::from(s) * full_lock_deg);
-            draw_steering(&mut image, human_deg, HUMAN);
-            draw_steering(&mut image, model_deg, MODEL);
+            let [recorded_deg, model_deg] =
+                [prediction.label, prediction.steering].map(|s| f64::from(s) * full_lock_deg);
+            draw_steering(&mut image, recorded_deg, REFERENCE_RGB);
+            draw_steering(&mut image, model_deg, MODEL_RGB);
             let name = recording.path.file_name().unwrap_or_default().to_string_lossy().into_owned();
             let caption = format!(
-                "{name}, line {}\nhuman {human_deg:+.1}°, model {model_deg:+.1}°: {:.1}° off",
+                "{name}, line {}\nrecorded {recorded_deg:+.1}°, model {model_deg:+.1}°: {:.1}° off",
                 recording.rows[row].line,
-                (model_deg - human_deg).abs()
+                (model_deg - recorded_deg).abs()
             );
             Some(Figure { source: image.jpeg_address(), caption, pixelated: false })
         })
@@ -374,7 +388,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn errors_are_averaged_by_the_human_angle() {
+    fn errors_are_averaged_by_the_recorded_angle() {
         let prediction = |label: f32, steering: f32| Prediction { steering, label, session: 0, time_s: 0.0 };
         // Labels of 0, 1, 10 and 11 degrees; errors of 2, 1, 5 and 1 degrees.
         let predictions = [prediction(0.0, 0.08), prediction(0.04, 0.0), prediction(0.4, 0.2), prediction(0.44, 0.48)];

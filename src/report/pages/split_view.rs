@@ -1,24 +1,26 @@
 //! The split of recordings into training and validation, to be looked at.
 
+use super::html::Page;
 use crate::dataset::leak::LeakAudit;
 use crate::dataset::split::{GUARD_MS, Split};
 use crate::dataset::{Flip, Item, Recording};
 use crate::recipe::Recipe;
+use crate::report::charts::chart::NARROW;
 use crate::report::charts::palette::{BLUE, INK, ORANGE, PALE, QUIET_INK, VERMILION};
 use crate::report::charts::steering::driven_times;
-use crate::report::charts::svg::{Anchor, Svg};
-use crate::report::pages::html::Page;
+use crate::report::charts::svg::{Anchor, Svg, text_width};
+use crate::report::tone::Tone;
 
 /// Recordings drawn; the rest is counted.
-const MOST_STRIPS: usize = 24;
-/// Width of a strip, pixels.
+const MAX_STRIPS: usize = 24;
+/// Width of the drawing, pixels.
 const WIDTH: f64 = 1120.0;
-/// Room for the name before the strip.
+/// Room for the name before a strip.
 const LEFT: f64 = 190.0;
 
 /// What becomes of a row.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Fate {
+enum RowFate {
     Training,
     Validation,
     /// Near a validation row, and used on neither side.
@@ -27,16 +29,16 @@ enum Fate {
     LeftOut,
 }
 
-impl Fate {
-    const ALL: [(Fate, &'static str, &'static str); 4] = [
-        (Fate::Training, BLUE, "training"),
-        (Fate::Validation, ORANGE, "validation"),
-        (Fate::Guard, VERMILION, "guard, on neither side"),
-        (Fate::LeftOut, PALE, "left out (balance, throttle)"),
+impl RowFate {
+    const ALL: [(RowFate, &'static str, &'static str); 4] = [
+        (RowFate::Training, BLUE, "training"),
+        (RowFate::Validation, ORANGE, "validation"),
+        (RowFate::Guard, VERMILION, "guard, on neither side"),
+        (RowFate::LeftOut, PALE, "left out (balance, throttle)"),
     ];
 
     fn colour(self) -> &'static str {
-        Fate::ALL[self as usize].1
+        RowFate::ALL[self as usize].1
     }
 }
 
@@ -56,16 +58,16 @@ struct Strip {
     name: String,
     length_s: f64,
     /// Stretches with the same fate, from and to in seconds driven.
-    stretches: Vec<(f64, f64, Fate)>,
+    stretches: Vec<(f64, f64, RowFate)>,
 }
 
 impl SplitView {
     /// What `split` makes of `recordings`.
     pub fn of(recordings: &[Recording], split: &Split, recipe: &Recipe) -> SplitView {
-        let strips = recordings.iter().enumerate().take(MOST_STRIPS);
+        let strips = recordings.iter().enumerate().take(MAX_STRIPS);
         SplitView {
             strips: strips.map(|(i, recording)| Strip::of(i, recording, split)).collect(),
-            more: recordings.len().saturating_sub(MOST_STRIPS),
+            more: recordings.len().saturating_sub(MAX_STRIPS),
             summary: split.summary(),
             audit: LeakAudit::of(split, recordings),
             training_labels: training_labels(recordings, split, recipe),
@@ -77,48 +79,62 @@ impl SplitView {
         for line in self.summary.lines() {
             page.paragraph(&format!("{line}."));
         }
-        page.drawings(&[self.draw()]);
+        page.drawings(&[self.figure()]);
         if self.more > 0 {
             page.paragraph(&format!("And {} more recordings.", self.more));
         }
-        page.advice(&format!("{}.", self.audit.summary()), self.audit.share() < 0.01);
+        let tone = if self.audit.share() < 0.01 { Tone::Good } else { Tone::Warning };
+        page.advice(&format!("{}.", self.audit.summary()), tone);
     }
 
-    fn draw(&self) -> String {
-        const STEP: f64 = 34.0;
-        let height = 70.0 + STEP * self.strips.len() as f64;
-        let mut svg = Svg::new(WIDTH, height);
-        let mut x = LEFT;
-        for (fate, colour, name) in Fate::ALL {
-            let style = if fate == Fate::LeftOut {
-                "fill=\"#ececec\" stroke=\"#888888\"".into()
-            } else {
-                format!("fill=\"{colour}\"")
-            };
-            svg.rect([x, 10.0], [14.0, 14.0], &style);
-            svg.text([x + 20.0, 22.0], 13.0, Anchor::Start, "", name);
-            x += 40.0 + crate::report::charts::svg::text_width(name, 13.0);
+    /// The strips for a page: on wide ground and on a phone, where names stand above their strips.
+    fn figure(&self) -> String {
+        let (wide, narrow) = (self.draw(WIDTH, LEFT), self.draw(NARROW, 8.0));
+        format!("<figure><div class=\"wide\">{wide}</div><div class=\"narrow\">{narrow}</div></figure>\n")
+    }
+
+    fn draw(&self, width: f64, left: f64) -> String {
+        let beside = left >= LEFT;
+        let step = if beside { 34.0 } else { 52.0 };
+        let mut svg = Svg::new(width, 88.0 + step * self.strips.len() as f64);
+        let (mut x, mut y) = (left, 10.0);
+        for (fate, colour, name) in RowFate::ALL {
+            let needed = 40.0 + text_width(name, 13.0);
+            if x > left && x + needed > width {
+                (x, y) = (left, y + 19.0);
+            }
+            let outline = if fate == RowFate::LeftOut { format!(" stroke=\"{QUIET_INK}\"") } else { String::new() };
+            svg.rect([x, y], [14.0, 14.0], &format!("fill=\"{colour}\"{outline}"));
+            svg.text([x + 20.0, y + 12.0], 13.0, Anchor::Start, "", name);
+            x += needed;
         }
         let longest_s = self.strips.iter().map(|strip| strip.length_s).fold(1e-9, f64::max);
-        let place = |s: f64| LEFT + s / longest_s * (WIDTH - LEFT - 20.0);
+        let place = |s: f64| left + s / longest_s * (width - left - 20.0);
+        let above = y + 26.0;
         for (i, strip) in self.strips.iter().enumerate() {
-            let top = 36.0 + STEP * i as f64;
-            svg.text([LEFT - 10.0, top + 16.0], 13.0, Anchor::End, "", &shortened(&strip.name, 26));
+            let mut top = above + step * i as f64;
+            if beside {
+                svg.text([left - 10.0, top + 16.0], 13.0, Anchor::End, "", &shortened(&strip.name, 26));
+            } else {
+                svg.text([left, top + 13.0], 13.0, Anchor::Start, "", &shortened(&strip.name, 44));
+                top += 19.0;
+            }
             for (from, to, fate) in &strip.stretches {
                 let width = (place(*to) - place(*from)).max(0.6);
                 svg.rect([place(*from), top], [width, 24.0], &format!("fill=\"{}\"", fate.colour()));
             }
         }
-        let bottom = 36.0 + STEP * self.strips.len() as f64;
-        let step = [5.0, 10.0, 30.0, 60.0, 120.0, 300.0, 600.0, 1800.0, 3600.0, 36_000.0];
-        let step = step.into_iter().find(|step| longest_s / step <= 12.0).unwrap_or(longest_s);
-        for k in 0..=(longest_s / step) as usize {
-            let at = place(k as f64 * step);
+        let bottom = above + step * self.strips.len() as f64;
+        let most_ticks = (width - left) / 80.0;
+        let seconds = [5.0, 10.0, 30.0, 60.0, 120.0, 300.0, 600.0, 1800.0, 3600.0, 36_000.0];
+        let seconds = seconds.into_iter().find(|seconds| longest_s / seconds <= most_ticks).unwrap_or(longest_s);
+        for k in 0..=(longest_s / seconds) as usize {
+            let at = place(k as f64 * seconds);
             svg.line([at, bottom - 6.0], [at, bottom], &format!("stroke=\"{INK}\""));
-            svg.text([at, bottom + 14.0], 12.0, Anchor::Middle, "", &format!("{:.0}", k as f64 * step));
+            svg.text([at, bottom + 14.0], 12.0, Anchor::Middle, "", &format!("{:.0}", k as f64 * seconds));
         }
-        let label = "time driven, s";
-        svg.text([LEFT - 10.0, bottom + 14.0], 13.0, Anchor::End, &format!("fill=\"{QUIET_INK}\""), label);
+        let quiet = format!("fill=\"{QUIET_INK}\"");
+        svg.text([(left + width) / 2.0, bottom + 32.0], 13.0, Anchor::Middle, &quiet, "time driven, s");
         svg.finish()
     }
 }
@@ -126,26 +142,26 @@ impl SplitView {
 impl Strip {
     fn of(index: usize, recording: &Recording, split: &Split) -> Strip {
         let times = driven_times(recording);
-        let mut fates = vec![Fate::LeftOut; recording.rows.len()];
+        let mut fates = vec![RowFate::LeftOut; recording.rows.len()];
         let here = |side: &[Item]| -> Vec<usize> {
             side.iter().filter(|item| usize::from(item.recording) == index).map(|item| item.row as usize).collect()
         };
         let validation = here(&split.validation);
         // A row may be on both sides where single images are split: validation is drawn last.
-        here(&split.training).into_iter().for_each(|row| fates[row] = Fate::Training);
+        here(&split.training).into_iter().for_each(|row| fates[row] = RowFate::Training);
         for &row in &validation {
             let session = recording.sessions[recording.session_of(row)].clone();
             let near = |other: &usize| (recording.rows[*other].time_ms - recording.rows[row].time_ms).abs() <= GUARD_MS;
             let before = (session.start..row).rev().take_while(near);
             let after = (row + 1..session.end).take_while(near);
             before.chain(after).filter(|_| !split.spec.mode.leaks()).for_each(|other| {
-                if fates[other] == Fate::LeftOut {
-                    fates[other] = Fate::Guard;
+                if fates[other] == RowFate::LeftOut {
+                    fates[other] = RowFate::Guard;
                 }
             });
         }
-        validation.into_iter().for_each(|row| fates[row] = Fate::Validation);
-        let mut stretches: Vec<(f64, f64, Fate)> = Vec::new();
+        validation.into_iter().for_each(|row| fates[row] = RowFate::Validation);
+        let mut stretches: Vec<(f64, f64, RowFate)> = Vec::new();
         for session in &recording.sessions {
             for row in session.clone() {
                 let end = times.get(row + 1).filter(|_| row + 1 < session.end).copied().unwrap_or(times[row] + 0.1);
@@ -192,14 +208,14 @@ mod tests {
         let split =
             crate::dataset::split::split(&recordings, &recipe.split, &recipe.samples, &recipe.balance, 1).unwrap();
         let view = SplitView::of(&recordings, &split, &recipe);
-        let seconds = |wanted: Fate| -> f64 {
+        let seconds = |wanted: RowFate| -> f64 {
             view.strips[0].stretches.iter().filter(|s| s.2 == wanted).map(|(from, to, _)| to - from).sum()
         };
-        assert!((seconds(Fate::Validation) - 0.1 * split.validation.len() as f64).abs() < 1e-6);
-        assert!((seconds(Fate::Training) - 0.1 * split.training.len() as f64).abs() < 1e-6);
-        assert!((seconds(Fate::LeftOut) - 0.1 * split.balanced_rows as f64).abs() < 3.0);
+        assert!((seconds(RowFate::Validation) - 0.1 * split.validation.len() as f64).abs() < 1e-6);
+        assert!((seconds(RowFate::Training) - 0.1 * split.training.len() as f64).abs() < 1e-6);
+        assert!((seconds(RowFate::LeftOut) - 0.1 * split.balanced_rows as f64).abs() < 3.0);
         assert!(split.guard_rows >= 10);
-        assert!((seconds(Fate::Guard) - 0.1 * split.guard_rows as f64).abs() < 0.3, "{}", seconds(Fate::Guard));
+        assert!((seconds(RowFate::Guard) - 0.1 * split.guard_rows as f64).abs() < 0.3, "{}", seconds(RowFate::Guard));
         // Three cameras, no mirror; the left camera's labels are 0.25 higher.
         assert_eq!(view.training_labels.len(), 3 * split.training.len());
         assert_eq!(view.training_labels[1] - view.training_labels[0], 0.25);

@@ -4,14 +4,17 @@ use std::path::Path;
 
 use super::film::Video;
 use super::onlooker::Onlooker;
-use super::painter::{Captions, FilmFrame, Painter};
+use super::painter::{Captions, FilmFrame, FilmScales, Painter};
 use super::summary::VideoSummary;
 use crate::error::{Error, Result};
 use crate::observer::{Observer, Progress};
 use crate::picture::RgbImage;
 use crate::simulator::car::dynamics::MAX_STEER_DEG;
+use crate::simulator::car::expert::pursuit;
 use crate::simulator::trial::outcome::{DRIVE_HZ, Failure};
-use crate::simulator::{DriveEvent, DriveFrame, Driver, HEIGHT, Track, Trial, TrialOptions, WIDTH, run_trial_observed};
+use crate::simulator::{
+    DriveEvent, DriveFrame, Driver, HEIGHT, Simulation, Track, Trial, TrialOptions, WIDTH, run_trial_observed,
+};
 
 /// A video of a run that is yet to be driven.
 pub struct DriveVideo {
@@ -43,7 +46,12 @@ impl DriveVideo {
         fps: Option<f64>,
         onlooker: Option<Onlooker>,
     ) -> Result<DriveVideo> {
-        let video = Video::create(path, Painter::new(names, Some(track)), fps.unwrap_or(DRIVE_HZ as f64))?;
+        let saliency = onlooker.as_ref().is_some_and(Onlooker::colours);
+        let video = Video::create(
+            path,
+            Painter::new(names, scales(track), Some(track), saliency),
+            fps.unwrap_or(DRIVE_HZ as f64),
+        )?;
         let frame = FilmFrame { picture: RgbImage::filled(HEIGHT, WIDTH, [0; 3]), ..FilmFrame::default() };
         Ok(DriveVideo { video, frame, onlooker })
     }
@@ -102,6 +110,15 @@ impl FilmObserver<'_> {
         let way_m = driven.options.laps as f64 * simulation.track.length_m;
         self.observer.observe(Progress((simulation.progress_m / way_m).clamp(0.0, 1.0)))
     }
+}
+
+/// Scales for a drive on `track` that is yet to come: those that the expert needs. Its car is a metre from the line at most.
+fn scales(track: &Track) -> FilmScales {
+    let angles = track.stations.iter().step_by(5).map(|station| {
+        let heading_deg = station.ty.atan2(station.tx).to_degrees();
+        pursuit(&Simulation::posed(track, [station.x, station.y], heading_deg, 10.0)) * MAX_STEER_DEG
+    });
+    FilmScales { darkest_m: 1.0, ..FilmScales::covering(angles, [].into_iter()) }
 }
 
 /// What a run came to, in a few words.

@@ -24,6 +24,11 @@ impl Onlooker {
         Ok(Onlooker { pilot, saliency })
     }
 
+    /// Whether it colours the pictures.
+    pub fn colours(&self) -> bool {
+        self.saliency.is_some()
+    }
+
     /// Angle of the front wheels at steering 1, degrees, of the car that the model was made for.
     pub fn full_lock_deg(&self) -> f64 {
         self.pilot.recipe().full_lock_deg

@@ -8,8 +8,8 @@ use super::lettering::{Size, draw_text, draw_text_right, end_of};
 use crate::dataset::resize::{Interpolation, Resizer};
 use crate::picture::RgbImage;
 use crate::report::charts::map::{self, Projection};
-use crate::report::charts::palette::heat;
-use crate::report::charts::steering_line::{HUMAN, MODEL, draw_steering};
+use crate::report::charts::palette::{self, MODEL_RGB as MODEL, REFERENCE_RGB as REFERENCE};
+use crate::report::charts::steering_line::draw_steering;
 use crate::simulator::Track;
 use crate::simulator::car::dynamics::MAX_STEER_DEG;
 
@@ -24,8 +24,8 @@ const MAP: [f64; 4] = [660.0, 66.0, 940.0, 300.0];
 /// Steering of the last seconds: top and bottom with a map, and without.
 const TRACE: [f64; 2] = [386.0, 456.0];
 const LONE_TRACE: [f64; 2] = [110.0, 430.0];
-/// Ranges of its scale, degrees to either side.
-const TRACE_RANGES_DEG: [f64; 3] = [5.0, 10.0, MAX_STEER_DEG];
+/// Ranges that the curve of steering may have, degrees to either side.
+const STEERING_RANGES_DEG: [f64; 3] = [5.0, 10.0, MAX_STEER_DEG];
 /// Seconds of steering that are shown.
 const TRACE_S: f64 = 10.0;
 /// The steering wheel: centre (x, y) and radius.
@@ -80,9 +80,31 @@ pub struct Captions {
     pub reference: &'static str,
 }
 
-/// Paints scenes. Keeps the way so far.
+/// Scales that a film keeps from its first frame to its last.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct FilmScales {
+    /// Range of the curve of steering, degrees to either side.
+    pub steering_deg: f64,
+    /// Distance from the line that has the darkest colour on the map, m.
+    pub darkest_m: f64,
+}
+
+impl FilmScales {
+    /// Scales for a film in which the wheels turn by `angles_deg` and the car is `cte_m` from its line. What turns further is
+    /// drawn at the border.
+    pub fn covering(angles_deg: impl Iterator<Item = f64>, cte_m: impl Iterator<Item = f64>) -> FilmScales {
+        let widest = angles_deg.map(f64::abs).fold(0.0, f64::max);
+        let range = STEERING_RANGES_DEG.into_iter().find(|range| widest <= *range);
+        FilmScales { steering_deg: range.unwrap_or(MAX_STEER_DEG), darkest_m: map::darkest_m(cte_m) }
+    }
+}
+
+/// Paints frames. Keeps the way so far.
 pub struct Painter {
     names: Captions,
+    scales: FilmScales,
+    /// Whether the camera's picture shows what excites the model.
+    saliency: bool,
     /// Everything that stays, with the way on the map.
     base: RgbImage,
     projection: Option<Projection>,
@@ -99,8 +121,9 @@ struct Camera {
 }
 
 impl Painter {
-    /// An empty painter, with a map if the track is known.
-    pub fn new(names: Captions, track: Option<&Track>) -> Painter {
+    /// A painter that has seen nothing yet, with a map if the track is known. With `saliency` it explains the colours that
+    /// saliency adds.
+    pub fn new(names: Captions, scales: FilmScales, track: Option<&Track>, saliency: bool) -> Painter {
         let mut base = RgbImage::filled(SIZE[0], SIZE[1], GROUND);
         let letters = |size: Size, bold| (ASIDE[1] - ASIDE[0]) / size.advance(bold);
         draw_text(
@@ -113,8 +136,17 @@ impl Painter {
         );
         let subtitle = end_of(&names.subtitle, letters(Size::Small, false));
         draw_text(&mut base, [ASIDE[0], 36], Size::Small, false, QUIET_INK, &subtitle);
-        let projection = track.and_then(|track| draw_track(&mut base, track));
-        let mut painter = Painter { names, base, projection, last_place: None, camera: None, trace: VecDeque::new() };
+        let projection = track.and_then(|track| draw_track(&mut base, track, scales.darkest_m));
+        let mut painter = Painter {
+            names,
+            scales,
+            saliency,
+            base,
+            projection,
+            last_place: None,
+            camera: None,
+            trace: VecDeque::new(),
+        };
         painter.draw_scales();
         painter
     }
@@ -134,7 +166,7 @@ impl Painter {
         let to = projection.place(place);
         match self.last_place.filter(|_| !frame.put_back) {
             Some(from) => {
-                let colour = heat(map::share(frame.cte_m.unwrap_or_default()));
+                let colour = palette::heat(map::share(frame.cte_m.unwrap_or_default(), self.scales.darkest_m));
                 self.base.draw_line(from, to, 3.0, colour);
             }
             None if frame.put_back => {
@@ -151,6 +183,9 @@ impl Painter {
     pub(super) fn paint(&mut self, frame: &FilmFrame, out: &mut RgbImage) {
         out.clone_from(&self.base);
         self.paint_camera(frame, out);
+        if self.saliency {
+            explain_saliency(out);
+        }
         self.paint_wheel(frame, out);
         self.paint_angles(frame, out);
         self.paint_figures(frame, out);
@@ -174,7 +209,7 @@ impl Painter {
         let [_, bottom] = self.trace_edges();
         let base = &mut self.base;
         let middle = f64::midpoint(BAR[0], BAR[1]);
-        for (row, name, colour) in [(0, self.names.model, MODEL), (1, Some(self.names.reference), HUMAN)] {
+        for (row, name, colour) in [(0, self.names.model, MODEL), (1, Some(self.names.reference), REFERENCE)] {
             let Some(name) = name else { continue };
             let top = 330 + 36 * row;
             draw_text(base, [164, top + 2], Size::Medium, true, INK, name);
@@ -207,7 +242,7 @@ impl Painter {
             other => other.insert(Camera::new(from)),
         };
         camera.resizer.apply(&frame.picture.pixels, &mut camera.picture.pixels);
-        for (deg, colour) in [(frame.reference_deg, HUMAN), (frame.model_deg, MODEL)] {
+        for (deg, colour) in [(frame.reference_deg, REFERENCE), (frame.model_deg, MODEL)] {
             if let Some(deg) = deg {
                 draw_steering(&mut camera.picture, deg, colour);
             }
@@ -234,18 +269,18 @@ impl Painter {
         }
         out.draw_line([x, y], [x, y], 26.0, [0x3a; 3]);
         // The top of the wheel, in the colour of who holds it.
-        let holds = if frame.model_deg.is_some() { MODEL } else { HUMAN };
+        let holds = if frame.model_deg.is_some() { MODEL } else { REFERENCE };
         out.draw_line(at(turn - 9.0, radius), at(turn + 9.0, radius), 9.0, holds);
         if let (Some(_), Some(reference)) = (frame.model_deg, frame.reference_deg) {
             let turn = WHEEL_RATIO * reference;
             out.draw_line(at(turn, radius - 14.0), at(turn, radius + 8.0), 6.0, GROUND);
-            out.draw_line(at(turn, radius - 13.0), at(turn, radius + 7.0), 3.0, HUMAN);
+            out.draw_line(at(turn, radius - 13.0), at(turn, radius + 7.0), 3.0, REFERENCE);
         }
     }
 
     fn paint_angles(&self, frame: &FilmFrame, out: &mut RgbImage) {
         let middle = f64::midpoint(BAR[0], BAR[1]);
-        for (row, deg, colour) in [(0, frame.model_deg, MODEL), (1, frame.reference_deg, HUMAN)] {
+        for (row, deg, colour) in [(0, frame.model_deg, MODEL), (1, frame.reference_deg, REFERENCE)] {
             let Some(deg) = deg else { continue };
             let top = 330 + 36 * row;
             draw_text_right(out, [632, top + 1], Size::Large, true, INK, &(signed(deg, 1) + "°"));
@@ -285,9 +320,7 @@ impl Painter {
     fn paint_trace(&self, now_s: f64, out: &mut RgbImage) {
         let [top, bottom] = self.trace_edges();
         let [left, right] = ASIDE.map(|x| x as f64);
-        let angles = self.trace.iter().flat_map(|(_, model, reference)| [*model, *reference]).flatten();
-        let widest = angles.map(f64::abs).fold(0.0, f64::max);
-        let range_deg = TRACE_RANGES_DEG.into_iter().find(|range| widest <= *range).unwrap_or(MAX_STEER_DEG);
+        let range_deg = self.scales.steering_deg;
         let y = |deg: f64| f64::midpoint(top, bottom) - (deg / range_deg).clamp(-1.0, 1.0) * (bottom - top) / 2.0;
         for (deg, grey) in [(-range_deg, GRID), (0.0, [0xa0; 3]), (range_deg, GRID)] {
             out.draw_line([left, y(deg)], [right, y(deg)], 1.0, grey);
@@ -295,8 +328,8 @@ impl Painter {
         let range = format!("±{range_deg:.0}°");
         draw_text_right(out, [ASIDE[1], bottom as usize + 4], Size::Small, false, QUIET_INK, &range);
         let x = |time_s: f64| right - (now_s - time_s) / TRACE_S * (right - left);
-        type Moment = (f64, Option<f64>, Option<f64>);
-        let mut curve = |of: fn(&Moment) -> Option<f64>, colour| {
+        type TracePoint = (f64, Option<f64>, Option<f64>);
+        let mut curve = |of: fn(&TracePoint) -> Option<f64>, colour| {
             for (a, b) in self.trace.iter().zip(self.trace.iter().skip(1)) {
                 if let (Some(from), Some(to)) = (of(a), of(b)) {
                     out.draw_line([x(a.0), y(from)], [x(b.0), y(to)], 2.0, colour);
@@ -304,7 +337,7 @@ impl Painter {
             }
         };
         curve(|moment| moment.1, MODEL);
-        curve(|moment| moment.2, HUMAN);
+        curve(|moment| moment.2, REFERENCE);
     }
 }
 
@@ -328,7 +361,7 @@ fn signed(value: f64, decimals: usize) -> String {
 }
 
 /// Draws the road and what the colours of the way mean.
-fn draw_track(base: &mut RgbImage, track: &Track) -> Option<Projection> {
+fn draw_track(base: &mut RgbImage, track: &Track, darkest_m: f64) -> Option<Projection> {
     let edges = map::edges(track);
     let projection = Projection::fitting(edges.iter().flatten().copied(), MAP)?;
     for (beside_px, colour) in [(1.6, ROAD_EDGE), (0.0, ROAD)] {
@@ -346,17 +379,32 @@ fn draw_track(base: &mut RgbImage, track: &Track) -> Option<Projection> {
     let [left, top] = [ASIDE[0], 314];
     for k in 0..map::COLOURS {
         let x = (left + 14 * k) as f64;
-        fill(base, [x, top as f64, x + 14.0, top as f64 + 10.0], heat(map::step_share(k)));
+        fill(base, [x, top as f64, x + 14.0, top as f64 + 10.0], palette::heat(map::step_share(k)));
     }
     let bar_m = projection.bar_m(110.0);
     let bar_px = bar_m * projection.scale;
     let right = ASIDE[1] as f64;
     fill(base, [right - bar_px, top as f64 + 4.0, right, top as f64 + 7.0], INK);
-    let darkest = format!("0 to {:.0} m+ from line", map::DARKEST_M);
-    draw_text(base, [left, top + 14], Size::Small, false, QUIET_INK, &darkest);
+    let range = format!("0 to {darkest_m} m+ from line");
+    draw_text(base, [left, top + 14], Size::Small, false, QUIET_INK, &range);
     draw_text_right(base, [ASIDE[1], top + 14], Size::Small, false, QUIET_INK, &format!("{bar_m:.0} m"));
     draw_text(base, [left, top + 32], Size::Small, false, QUIET_INK, "× put back");
     Some(projection)
+}
+
+/// Explains, in the lower left corner of the camera's picture, what the colours of saliency mean.
+fn explain_saliency(out: &mut RgbImage) {
+    let (bottom, words, bar) = (CAMERA[0] as f64 - 8.0, ["excites it: little", "much"], 96.0);
+    let width = |text: &str| (text.len() * Size::Small.advance(false)) as f64;
+    let from = 14.0 + width(words[0]) + 8.0;
+    fill(out, [8.0, bottom - 22.0, from + bar + 8.0 + width(words[1]) + 6.0, bottom], [0x18; 3]);
+    draw_text(out, [14, bottom as usize - 19], Size::Small, false, [0xff; 3], words[0]);
+    for k in 0..16 {
+        let left = from + bar * f64::from(k) / 16.0;
+        let colour = palette::saliency(f64::from(k) / 15.0);
+        fill(out, [left, bottom - 17.0, left + bar / 16.0, bottom - 6.0], colour);
+    }
+    draw_text(out, [(from + bar + 8.0) as usize, bottom as usize - 19], Size::Small, false, [0xff; 3], words[1]);
 }
 
 /// Fills a rectangle: left, top, right, bottom, pixels.
@@ -373,6 +421,8 @@ fn fill(picture: &mut RgbImage, [left, top, right, bottom]: [f64; 4], rgb: [u8; 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    const SCALES: FilmScales = FilmScales { steering_deg: 10.0, darkest_m: 2.0 };
 
     fn names() -> Captions {
         Captions { title: "lake".into(), subtitle: "a model".into(), model: Some("model"), reference: "expert" }
@@ -393,7 +443,7 @@ mod tests {
 
     #[test]
     fn bars_and_wheel_show_who_steers_where_and_how_far() {
-        let mut painter = Painter::new(names(), None);
+        let mut painter = Painter::new(names(), SCALES, None, false);
         let mut out = RgbImage::default();
         let mut bars = |model_deg, reference_deg| {
             let frame = frame(model_deg, reference_deg);
@@ -401,12 +451,15 @@ mod tests {
             painter.paint(&frame, &mut out);
             let middle = f64::midpoint(BAR[0], BAR[1]) as usize;
             let (left, right) = ([BAR[0] as usize, 324, middle - 2, 396], [middle + 2, 324, BAR[1] as usize, 396]);
-            [(left, MODEL), (right, MODEL), (left, HUMAN), (right, HUMAN)]
+            [(left, MODEL), (right, MODEL), (left, REFERENCE), (right, REFERENCE)]
                 .map(|(part, colour)| count(&out, part, colour))
         };
-        let [model_left, model_right, human_left, human_right] = bars(12.5, -6.25);
-        assert!(model_left == 0 && human_right == 0 && model_right > 18 * 70 && model_right < 18 * 80, "{model_right}");
-        assert!((2 * human_left).abs_diff(model_right) < 18 * 4, "{human_left} {model_right}");
+        let [model_left, model_right, reference_left, reference_right] = bars(12.5, -6.25);
+        assert!(
+            model_left == 0 && reference_right == 0 && model_right > 18 * 70 && model_right < 18 * 80,
+            "{model_right}"
+        );
+        assert!((2 * reference_left).abs_diff(model_right) < 18 * 4, "{reference_left} {model_right}");
         let [far, ..] = bars(-90.0, 0.0);
         assert!(far <= 18 * 151, "a bar ends where the scale ends: {far}");
     }
@@ -414,14 +467,14 @@ mod tests {
     #[test]
     fn the_way_grows_on_the_map_in_the_colour_of_its_error_and_is_not_drawn_where_the_car_was_lifted() {
         let track = Track::load("lake").unwrap();
-        let mut painter = Painter::new(names(), Some(&track));
+        let mut painter = Painter::new(names(), SCALES, Some(&track), false);
         let way = |painter: &mut Painter, s_m: f64, cte_m: f64, put_back| {
             let station = track.at(s_m);
             let place = Some([station.x, station.y]);
             painter.notice(&FilmFrame { place, put_back, cte_m: Some(cte_m), ..frame(0.0, 0.0) });
         };
         let map = MAP.map(|edge| edge as usize);
-        let [near, far] = [0.1, 1.9].map(|cte_m| heat(map::share(cte_m)));
+        let [near, far] = [0.1, 1.9].map(|cte_m| palette::heat(map::share(cte_m, 2.0)));
         let before = count(&painter.base, map, far);
         for k in 0..50 {
             way(&mut painter, f64::from(k), 0.1, false);
@@ -437,13 +490,31 @@ mod tests {
     }
 
     #[test]
+    fn a_film_keeps_its_scale_of_steering() {
+        let mut painter = Painter::new(names(), SCALES, None, false);
+        let mut heights = Vec::new();
+        for (k, model_deg) in [2.0, 2.0, 24.0, 2.0, 2.0].into_iter().enumerate() {
+            let shown = FilmFrame { time_s: k as f64, ..frame(model_deg, 0.0) };
+            let mut out = RgbImage::default();
+            painter.notice(&shown);
+            painter.paint(&shown, &mut out);
+            let newest =
+                (LONE_TRACE[0] as usize..LONE_TRACE[1] as usize).find(|y| out.pixel(*y, ASIDE[1] - 3) == MODEL);
+            heights.extend((k == 1 || k == 4).then_some(newest.unwrap()));
+        }
+        assert_eq!(heights[0], heights[1], "2 degrees stand where they stood before");
+        let scales = FilmScales::covering([3.0, -7.0].into_iter(), [0.1, 0.3].into_iter());
+        assert_eq!(scales, FilmScales { steering_deg: 10.0, darkest_m: 0.5 });
+    }
+
+    #[test]
     fn numbers_have_their_sign_and_zero_has_none() {
         assert_eq!([1.25, -0.04, 0.0, -0.05].map(|v| signed(v, 1)), ["+1.2", "0.0", "0.0", "-0.1"]);
     }
 
     #[test]
     fn pictures_of_any_size_lie_within_the_camera_and_text_is_not_cut_off() {
-        let mut painter = Painter::new(Captions { title: "x".repeat(200), ..names() }, None);
+        let mut painter = Painter::new(Captions { title: "x".repeat(200), ..names() }, SCALES, None, true);
         let mut out = RgbImage::default();
         for size in [[120, 160], [160, 320], [1, 1], [40, 900], [2000, 30]] {
             let frame =

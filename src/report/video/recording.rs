@@ -1,10 +1,10 @@
-//! The video of a recording: what the camera saw and how the person steered, beside what a model would have done.
+//! The video of a recording: what the camera saw and how the driver steered, beside what a model would have done.
 
 use std::path::Path;
 
 use super::film::{Video, ended_early};
 use super::onlooker::Onlooker;
-use super::painter::{Captions, FilmFrame, Painter};
+use super::painter::{Captions, FilmFrame, FilmScales, Painter};
 use super::summary::VideoSummary;
 use crate::dataset::{self, Recording, View};
 use crate::error::{Error, Result};
@@ -37,9 +37,13 @@ pub fn film(
         title: name(path),
         subtitle: format!("recording, {} rows, {own:.3} Hz", recording.rows.len()).replace(".000", ""),
         model: onlooker.as_ref().map(|_| "model"),
-        reference: "human",
+        reference: "driver",
     };
-    let mut video = Video::create(out, Painter::new(names, None), fps.unwrap_or(own.clamp(1.0, 60.0)))?;
+    let angles = recording.rows.iter().map(|row| f64::from(row.steering) * full_lock_deg);
+    let scales = FilmScales::covering(angles, std::iter::empty());
+    let saliency = onlooker.as_ref().is_some_and(Onlooker::colours);
+    let mut video =
+        Video::create(out, Painter::new(names, scales, None, saliency), fps.unwrap_or(own.clamp(1.0, 60.0)))?;
     let mut frame = FilmFrame::default();
     let mut session_begins_s = 0.0;
     let (mut stopped, mut unreadable) = (false, 0);

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use super::film::{Video, ended_early};
 use super::lettering::end_of;
 use super::onlooker::Onlooker;
-use super::painter::{Captions, FilmFrame, Painter};
+use super::painter::{Captions, FilmFrame, FilmScales, Painter};
 use super::summary::VideoSummary;
 use crate::error::{Error, Result};
 use crate::observer::{Observer, Progress};
@@ -63,7 +63,15 @@ pub fn film(
         model: Some(if onlooker.is_some() { "model" } else { "driver" }),
         reference: "expert",
     };
-    let painter = Painter::new(names, Some(&track));
+    let mut angles: Vec<f64> = way.iter().map(|waypoint| waypoint.steering * MAX_STEER_DEG).collect();
+    for (waypoint, heading_deg) in way.iter().zip(&poses) {
+        simulation.pose([waypoint.x_m, waypoint.y_m], *heading_deg, speed_mps(waypoint));
+        angles.push(expert::pursuit(&simulation) * MAX_STEER_DEG);
+    }
+    let scales = FilmScales::covering(angles.into_iter(), way.iter().map(|waypoint| waypoint.cte_m));
+    let mut simulation = Simulation::posed(&track, [first.x_m, first.y_m], poses[0], speed_mps(first));
+    let saliency = onlooker.as_ref().is_some_and(Onlooker::colours);
+    let painter = Painter::new(names, scales, Some(&track), saliency);
     let mut video = Video::create(out, painter, fps.unwrap_or(DRIVE_HZ as f64))?;
     let mut eye = FrontCamera::new(&track, seed);
     let mut frame = FilmFrame { picture: RgbImage::filled(HEIGHT, WIDTH, [0; 3]), ..FilmFrame::default() };

@@ -1,4 +1,4 @@
-//! The front camera of a run, with the light that its seed draws.
+//! The front camera of a trial, with the light that its seed draws.
 
 use crate::Result;
 use crate::simulator::camera::jpeg;
@@ -9,7 +9,7 @@ use crate::simulator::car::simulation::Simulation;
 use crate::simulator::scenery::light::Variant;
 use crate::simulator::track::Track;
 
-/// Takes the pictures that a driver sees. Keeps its buffers.
+/// Renders the frames that a driver sees. Keeps its buffers.
 pub struct FrontCamera<'a> {
     track: &'a Track,
     variant: Variant,
@@ -19,7 +19,7 @@ pub struct FrontCamera<'a> {
 }
 
 impl<'a> FrontCamera<'a> {
-    /// The camera of the run `seed`.
+    /// The camera of the trial `seed`.
     pub fn new(track: &'a Track, seed: u64) -> FrontCamera<'a> {
         FrontCamera {
             track,
@@ -30,7 +30,7 @@ impl<'a> FrontCamera<'a> {
         }
     }
 
-    /// The JPEG of what is before the car.
+    /// The frame in front of the car, as JPEG.
     ///
     /// # Errors
     /// If the picture cannot be encoded.
@@ -46,7 +46,7 @@ impl<'a> FrontCamera<'a> {
         Ok(&self.bytes)
     }
 
-    /// The same, decoded again: what is left of the picture after JPEG.
+    /// The same frame, encoded as JPEG and decoded again.
     ///
     /// # Errors
     /// If the picture cannot be encoded or decoded.

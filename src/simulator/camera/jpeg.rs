@@ -32,14 +32,14 @@ pub fn decode(bytes: &[u8], frame: &mut RgbFrame) -> Result<()> {
     JpegDecoder::new(ZCursor::new(bytes)).decode_into(&mut frame.pixels).map_err(|e| fail(&e))
 }
 
-/// A camera picture as it arrives at a driver: encoded and decoded. Keeps its buffer.
+/// Encodes and decodes a frame, as on its way to a driver. Keeps its buffer.
 #[derive(Default)]
 pub struct RoundTrip {
     bytes: Vec<u8>,
 }
 
 impl RoundTrip {
-    /// Replaces `frame` by what is left of it after JPEG.
+    /// Replaces `frame` by its decoded JPEG.
     ///
     /// # Errors
     /// As [`encode`] and [`decode`].

@@ -1,4 +1,4 @@
-//! Draws what stands upright on the ground: walls and things beside the road.
+//! Draws what stands upright on the ground: walls, and objects beside the road as billboards.
 
 use crate::simulator::camera::pinhole::{FOCAL_PX, HEIGHT, RgbFrame, WIDTH};
 use crate::simulator::camera::view::{FULL, View};
@@ -7,12 +7,12 @@ use crate::simulator::road::spec::Wall;
 use crate::simulator::scenery::texel::fixed;
 use crate::simulator::scenery::world::{Sprite, WallPiece};
 
-/// Nothing nearer than this is drawn, m.
-const NEAREST_M: f32 = 0.35;
-/// Things farther than this are not drawn, m.
-const FARTHEST_M: f32 = 330.0;
+/// Minimum distance at which objects are drawn, m.
+const MIN_DISTANCE_M: f32 = 0.35;
+/// Maximum distance at which objects are drawn, m.
+const MAX_DISTANCE_M: f32 = 330.0;
 
-/// Bits behind the point of fixed-point places on a picture.
+/// Fraction bits of fixed-point coordinates on a picture.
 const FRACTION_BITS: u32 = 14;
 
 /// Draws walls and sprites over the ground of `frame`.
@@ -27,7 +27,7 @@ pub(crate) fn draw(depths: &mut [f32], view: &View, frame: &mut RgbFrame) {
 
 fn draw_sprite(depths: &mut [f32], view: &View, sprite: &Sprite, frame: &mut RgbFrame) {
     let foot = view.camera.view(sprite.foot);
-    if foot.z < 1.5 || foot.z > FARTHEST_M || foot.x.abs() > 1.3 * foot.z + 6.0 {
+    if foot.z < 1.5 || foot.z > MAX_DISTANCE_M || foot.x.abs() > 1.3 * foot.z + 6.0 {
         return;
     }
     let picture = &view.world.pictures[sprite.picture];
@@ -125,17 +125,17 @@ fn wall_colour(wall: Wall, along_m: f32, up_m: f32) -> Option<[f32; 3]> {
 
 fn draw_wall(depths: &mut [f32], view: &View, piece: &WallPiece, frame: &mut RgbFrame) {
     let (mut a, mut b) = (view.camera.view(piece.from), view.camera.view(piece.to));
-    if a.z.max(b.z) < NEAREST_M || a.z.min(b.z) > FARTHEST_M / 2.0 {
+    if a.z.max(b.z) < MIN_DISTANCE_M || a.z.min(b.z) > MAX_DISTANCE_M / 2.0 {
         return;
     }
     let length = (b - a).dot(b - a).sqrt();
     let (mut along_a, mut along_b) = (0.0, length);
-    // What lies behind the picture is cut off.
-    if a.z < NEAREST_M {
-        let t = (NEAREST_M - a.z) / (b.z - a.z);
+    // Clips the part behind the camera.
+    if a.z < MIN_DISTANCE_M {
+        let t = (MIN_DISTANCE_M - a.z) / (b.z - a.z);
         (a, along_a) = (a + (b - a) * t, length * t);
-    } else if b.z < NEAREST_M {
-        let t = (NEAREST_M - b.z) / (a.z - b.z);
+    } else if b.z < MIN_DISTANCE_M {
+        let t = (MIN_DISTANCE_M - b.z) / (a.z - b.z);
         (b, along_b) = (b + (a - b) * t, length * (1.0 - t));
     }
     let screen =

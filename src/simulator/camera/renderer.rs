@@ -1,6 +1,6 @@
-//! Takes the picture: finds the ground behind each pixel, then looks up what lies there.
+//! Renders a frame: finds the ground behind each pixel, then looks up its colour.
 //!
-//! A picture is made in four passes, none of which calls a function of the mathematical library for a pixel:
+//! A frame takes four passes, none of which calls a function of the mathematical library per pixel:
 //!
 //! 1. *March*: in every eighth column, from the bottom up, the ray of each pixel is followed over the land until it goes
 //!    below it. A ray is never blocked nearer than the ray below it, so each search starts where the last one ended, and a
@@ -9,7 +9,7 @@
 //!    pixels at a time) and the road's texture or the land's map is looked up at the resolution that fits. Where the ground
 //!    breaks off between two columns, each pixel is marched on its own, from where the ray of the pixel below ended. Pixels
 //!    without ground show the sky.
-//! 3. *Stand*: walls and upright things are drawn where they are nearer than the ground.
+//! 3. *Objects*: walls and billboards are drawn where they are nearer than the ground.
 //! 4. *Bonnet*: the car's own bonnet, which is always in the same place.
 
 use crate::simulator::camera::bonnet::Bonnet;
@@ -26,7 +26,7 @@ const NEAREST: (f32, f32) = (0.9, -1.0);
 /// Inverse depths below the lowest row.
 const BELOW_PICTURE: [f32; WIDTH] = [1.0 / NEAREST.0; WIDTH];
 
-/// Takes pictures; keeps its buffers from one to the next.
+/// Renders frames; keeps its buffers from one frame to the next.
 pub struct Renderer {
     /// Inverse depth (1/m) at each row and marched column; 0 = sky.
     anchors: Vec<f32>,
@@ -42,7 +42,7 @@ impl Default for Renderer {
 }
 
 impl Renderer {
-    /// Takes the picture that `camera` (mounted at `mount`) sees of `world` under `variant`.
+    /// Renders what `camera` (mounted at `mount`) sees of `world` in the light of `variant`.
     pub fn render(&mut self, world: &World, variant: &Variant, camera: &Camera, mount: Mount, frame: &mut RgbFrame) {
         let eye = vec3(camera.eye.x - world.terrain.x0, camera.eye.y - world.terrain.y0, camera.eye.z);
         let columns = std::array::from_fn(|k| {
@@ -79,7 +79,7 @@ impl Renderer {
             // Shading looks at the row below too, so only what is hidden in both rows is left out.
             let hidden = self.bonnet.hidden_spans(mount, row.saturating_sub(1));
             for (k, (anchor, last)) in anchors.iter_mut().zip(&mut lasts).enumerate() {
-                // Above the first ray that meets no land none does.
+                // Once a ray meets no land, no ray above it does.
                 *anchor = 0.0;
                 if hidden.start < k && k < hidden.end {
                     continue;
@@ -113,7 +113,7 @@ impl Renderer {
             for (k, (out, depth)) in pixels.as_chunks_mut().0.iter_mut().zip(depths).enumerate() {
                 let (a, b) = (&spots[k], &spots[k + 1]);
                 if hidden.contains(&k) {
-                    // Nearer than anything that might be drawn there.
+                    // Nearer than any object, so that none is drawn there.
                     depth.fill(1.0 / NEAREST.0);
                     continue;
                 }

@@ -13,9 +13,9 @@ use crate::simulator::scenery::world::World;
 pub(super) const SPAN: usize = 8;
 /// Marched columns: one more than spans, so that the last span has two ends.
 pub(super) const ANCHORS: usize = WIDTH / SPAN + 1;
-/// Nothing farther than this is drawn as land, m.
-const FARTHEST_M: f32 = 380.0;
-/// Land this near takes the light at its very place, smoothly; farther the light of a texel of the map, m.
+/// Maximum distance at which land is drawn, m.
+const MAX_DISTANCE_M: f32 = 380.0;
+/// Up to this distance the light on the road is interpolated; beyond it, the nearest texel of the map gives the light, m.
 const SMOOTH_LIGHT_M: f32 = 45.0;
 
 /// Red and blue of a packed colour.
@@ -29,7 +29,7 @@ pub(super) struct View<'a> {
     pub(super) camera: &'a Camera,
     /// Grid coordinates of the eye; z is its height.
     pub(super) eye: Vec3,
-    /// How much the highest land is above the eye, m.
+    /// Height of the highest land above the eye, m.
     pub(super) rise: f32,
     /// Largest grid coordinates.
     pub(super) limit: (f32, f32),
@@ -56,8 +56,8 @@ pub(super) struct Spot {
     /// Place on the land's map, fixed-point.
     pub(super) x: i32,
     pub(super) y: i32,
-    /// Whether a road is near, and then: its look, place on its texture, fixed-point, light there, and how much it runs
-    /// along (cosine) and across (sine) the view.
+    /// Whether a road is near. If so, the fields below hold its look, the fixed-point coordinates on its texture, the light
+    /// there, and the cosine and sine of the angle between the road and the ray.
     pub(super) near_road: bool,
     pub(super) look: u32,
     pub(super) along: i32,
@@ -67,17 +67,17 @@ pub(super) struct Spot {
     pub(super) sin: f32,
 }
 
-/// The air between the eye and a place.
+/// The haze between the eye and a place.
 #[derive(Clone, Copy)]
 pub(super) struct Air {
-    /// Share of the place's own colour that comes through, of 256.
+    /// Share of the place's own colour that remains, of 256.
     clear: u32,
-    /// The air's own red and blue, and green, times its share.
+    /// The haze's own red and blue, and green, times its share.
     red_blue: u32,
     green: u32,
 }
 
-/// The resolutions that fit the distance of a place, and the air before it.
+/// The texture levels that fit the distance of a place, and the haze in front of it.
 #[derive(Clone, Copy)]
 pub(super) struct Levels<'a> {
     road: Level<'a>,
@@ -92,7 +92,7 @@ struct Place {
     y: i32,
     along: i32,
     across: i32,
-    /// Light in units of `1 / SPAN`, or 0 where the land's map is to tell.
+    /// Light in units of `1 / SPAN`, or 0 where the map of the land gives it.
     light: i32,
 }
 
@@ -105,7 +105,7 @@ impl View<'_> {
 
     /// Follows a ray from `from` (a depth where it is known to be above the land) to where it enters the land.
     ///
-    /// `last_fall` is the fall of the ray below, which met the land at `from`: on even land it tells where this one will.
+    /// `last_fall` is the fall of the ray below, which met the land at `from`: on even land it predicts where this ray hits.
     #[inline(always)]
     pub(super) fn march(&self, ray: Vec3, from: f32, last_fall: f32) -> Option<f32> {
         let gap = |t: f32| {
@@ -118,7 +118,7 @@ impl View<'_> {
             step = if even < step { even.abs() + 0.01 } else { step };
         }
         // Nothing is above the highest land.
-        let farthest = if ray.z > 0.0 { (self.rise / ray.z).min(FARTHEST_M) } else { FARTHEST_M };
+        let farthest = if ray.z > 0.0 { (self.rise / ray.z).min(MAX_DISTANCE_M) } else { MAX_DISTANCE_M };
         loop {
             let far = near + step;
             let far_gap = gap(far);
@@ -129,7 +129,7 @@ impl View<'_> {
                 return None;
             }
             (near, near_gap) = (far, far_gap);
-            // Longer steps where a step's length shows less.
+            // Steps grow with the distance, where their length matters less.
             step = 0.2 + near * (0.032 + 2e-4 * near);
         }
     }
@@ -171,8 +171,8 @@ impl View<'_> {
         spot
     }
 
-    /// Whether the ground runs smoothly from `a` to `b`; then what to add to the place of `b` along the road so that both
-    /// are on the same lap.
+    /// If the ground runs smoothly from `a` to `b`: the offset to add to `b.along` so that both lie on the same lap; `None`
+    /// where the ground breaks off.
     #[inline(always)]
     pub(super) fn join(&self, a: &Spot, b: &Spot) -> Option<i32> {
         // The sky has inverse depth 0 and so never joins land.
@@ -200,7 +200,7 @@ impl View<'_> {
         ((way + lap).abs() < along && (b.across - a.across).abs() < across).then_some(lap)
     }
 
-    /// The resolution that fits: the road's texture and the land's map; and the air's share of the colour.
+    /// The levels of the road's texture and of the map for the resolution at `a`, and the haze there.
     #[inline(always)]
     pub(super) fn levels(&self, a: &Spot, fall: f32) -> Levels<'_> {
         let wide = a.depth * (1.0 / FOCAL_PX);
@@ -213,7 +213,7 @@ impl View<'_> {
         Levels { road, ground, air: self.air(a.depth) }
     }
 
-    /// The air before a thing at `depth`.
+    /// The haze in front of an object at `depth`.
     #[inline(always)]
     pub(super) fn air(&self, depth: f32) -> Air {
         let share = fixed(255.0 * depth / (depth + self.world.haze_m)) as u32;
@@ -221,7 +221,7 @@ impl View<'_> {
         Air { clear: 256 - share, red_blue: (haze & RED_BLUE) * share, green: (haze >> 8 & 255) * share }
     }
 
-    /// Colours eight pixels between two marched columns.
+    /// Shades eight pixels between two marched columns.
     pub(super) fn shade_span(
         &self,
         a: &Spot,
@@ -273,7 +273,7 @@ impl View<'_> {
         }
     }
 
-    /// Colours one pixel of ground.
+    /// Shades one pixel of ground.
     #[inline(always)]
     fn put(&self, place: Place, near_road: bool, levels: &Levels, out: &mut [u8; 3]) {
         let mut texel = 0;
@@ -295,7 +295,7 @@ impl View<'_> {
         self.finish(red_blue | green << 8, FULL, &levels.air, out);
     }
 
-    /// Writes a pixel: `colour` (`0x__BBGGRR`) in `light` of 256, seen through the air, in the tone of the run. Red and
+    /// Writes a pixel: `colour` (`0x__BBGGRR`) in `light` of 256, seen through the haze, with the tone curve of the trial. Red and
     /// blue are computed in one word, green in another.
     #[inline(always)]
     pub(super) fn finish(&self, colour: u32, light: u32, air: &Air, out: &mut [u8; 3]) {
@@ -332,7 +332,7 @@ impl View<'_> {
         self.tone(colour & RED_BLUE, colour >> 8 & 255, out);
     }
 
-    /// Colours eight pixels between which the ground breaks off, each on its own. `below` are the inverse depths of the
+    /// Shades eight pixels between which the ground breaks off, one by one. `below` are the inverse depths of the
     /// pixels below.
     #[inline(never)]
     pub(super) fn shade_each(

@@ -5,9 +5,9 @@ use crate::simulator::car::keys;
 use crate::simulator::car::simulation::Simulation;
 use crate::simulator::math::atan;
 
-/// Distance looked ahead of the rear axle when standing, m.
+/// Look-ahead distance of a standing car, from the rear axle, m.
 const LOOK_AHEAD_M: f64 = 3.0;
-/// Further look ahead for each m/s.
+/// Additional look-ahead distance for each m/s of speed, s.
 const LOOK_AHEAD_S: f64 = 0.35;
 
 /// The steering, [-1, 1], that leads the rear axle onto the reference line a little way ahead.
@@ -19,7 +19,7 @@ pub fn pursuit(simulation: &Simulation) -> f64 {
     pursue(simulation, LOOK_AHEAD_M + LOOK_AHEAD_S * simulation.car.speed_mps)
 }
 
-/// Pursuit of the point `ahead` m from the rear axle.
+/// Steering towards the point of the line `ahead` m from the rear axle.
 fn pursue(simulation: &Simulation, ahead: f64) -> f64 {
     let (track, car) = (simulation.track, &simulation.car);
     let sign = if simulation.reverse { -1.0 } else { 1.0 };
@@ -32,9 +32,9 @@ fn pursue(simulation: &Simulation, ahead: f64) -> f64 {
     (wheels.to_degrees() / MAX_STEER_DEG).clamp(-1.0, 1.0)
 }
 
-/// Steering too small for a key press.
+/// Deadband: smaller steering presses no key.
 const TOLERATED: f64 = 0.05;
-/// Distance that the driver with keys looks ahead, m.
+/// Look-ahead distance of the driver with keys, m.
 const KEYBOARD_LOOK_AHEAD_M: f64 = 11.0;
 
 /// How the expert moves the wheel.
@@ -47,9 +47,10 @@ pub enum Style {
     Keyboard,
 }
 
-/// Turns wanted steering into what a driver with two keys makes of it.
+/// Turns wanted steering into that of a driver with two keys.
 ///
-/// The wheel moves as [`keys::wheel`] tells. The driver presses when what is still missing has added up, and lets go when it is made good.
+/// The wheel moves as [`keys::wheel`] tells. The driver presses a key when the integral of
+/// the missing steering is large enough, and releases it when the integral is nearly zero.
 #[derive(Clone, Debug, Default)]
 pub struct Keyboard {
     wheel: f64,
@@ -60,13 +61,12 @@ pub struct Keyboard {
 impl Keyboard {
     /// The wheel after one more step of 20 ms on the way of `simulation`.
     pub fn steer(&mut self, simulation: &Simulation) -> f64 {
-        // Who cannot steer finely looks farther ahead.
+        // Coarse steering needs a longer look-ahead.
         self.step(pursue(simulation, KEYBOARD_LOOK_AHEAD_M))
     }
 
     /// The wheel after one step in which `wanted` steering was called for.
     fn step(&mut self, wanted: f64) -> f64 {
-        // A little error is not worth a key.
         let wanted = if wanted.abs() < TOLERATED { 0.0 } else { wanted };
         self.missing = (self.missing + (wanted - self.wheel) * STEP_S).clamp(-0.2, 0.2);
         if self.pressed == 0.0 && self.missing.abs() > 0.022 {

@@ -2,10 +2,10 @@
 
 use crate::simulator::math::Rng;
 
-/// Time in which the disturbance forgets itself, s.
-const MEMORY_S: f64 = 0.5;
+/// Correlation time of the disturbance, s.
+const CORRELATION_S: f64 = 0.5;
 
-/// An autoregressive disturbance with zero mean.
+/// First-order autoregressive noise with zero mean.
 #[derive(Clone, Debug)]
 pub struct SteeringNoise {
     rng: Rng,
@@ -14,7 +14,7 @@ pub struct SteeringNoise {
 }
 
 impl SteeringNoise {
-    /// The disturbance of run `seed` with standard deviation `strength`, in units of the steering.
+    /// The disturbance of trial `seed` with standard deviation `strength`, in units of the steering.
     pub fn new(seed: u64, strength: f64) -> SteeringNoise {
         SteeringNoise { rng: Rng::new(seed, "steering noise"), strength, value: 0.0 }
     }
@@ -24,7 +24,7 @@ impl SteeringNoise {
         if self.strength == 0.0 {
             return 0.0;
         }
-        let keep = 1.0 - dt_s / MEMORY_S;
+        let keep = 1.0 - dt_s / CORRELATION_S;
         self.value = keep * self.value + (1.0 - keep * keep).sqrt() * self.strength * self.rng.normal();
         self.value
     }

@@ -6,7 +6,7 @@ use crate::simulator::math::{Rng, sin_cos, vec3};
 use crate::simulator::road::line::{Location, WALL_GAP_M};
 use crate::simulator::track::Track;
 
-/// Where and how a run begins.
+/// Where and how a drive starts.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Start {
     /// Place along the reference line, m.
@@ -20,7 +20,7 @@ pub struct Start {
 }
 
 impl Start {
-    /// What the seed of a run draws: place, direction, offset within ±0.5 m, heading within ±5 degrees.
+    /// Drawn by the seed of a trial: place, direction, offset within ±0.5 m, heading within ±5 degrees.
     pub fn draw(track: &Track, seed: u64) -> Start {
         let mut rng = Rng::new(seed, "start");
         Start {
@@ -45,7 +45,7 @@ pub struct Simulation<'a> {
     pub reverse: bool,
     /// Steps since the start.
     pub steps: u64,
-    /// Way made along the line since the start, m; falls when the car goes back.
+    /// Progress along the line since the start, m; decreases while the car drives backwards.
     pub progress_m: f64,
     /// Wheels off the road, 0 to 4.
     pub wheels_off: usize,
@@ -65,7 +65,7 @@ impl<'a> Simulation<'a> {
         let location = track.locate(car.x, car.y);
         let mut simulation =
             Simulation { track, car, location, reverse, steps: 0, progress_m: 0.0, wheels_off: 0, at_wall: false };
-        simulation.feel();
+        simulation.update_wheels();
         simulation
     }
 
@@ -98,21 +98,21 @@ impl<'a> Simulation<'a> {
         Simulation::with_car(track, Car::new(x, y, hx, hy, speed_mps), reverse)
     }
 
-    /// Takes the car to where a trajectory leads, counting the way and one step of time; otherwise as
+    /// Moves the car to the next point of a trajectory and counts its progress and one step of time; otherwise as
     /// [`posed`](Simulation::posed).
     pub fn pose(&mut self, [x, y]: [f64; 2], heading_deg: f64, speed_mps: f64) {
         let (hy, hx) = sin_cos(heading_deg.to_radians());
         let steering = self.car.steering;
         self.car = Car { steering, ..Car::new(x, y, hx, hy, speed_mps) };
-        self.arrive();
+        self.update_location();
     }
 
-    /// Puts the car elsewhere on the track; way and time go on.
+    /// Moves the car to another place on the track; progress and time are kept.
     pub fn put(&mut self, start: Start, speed_mps: f64) {
         let steering = self.car.steering;
         self.car = Car { steering, ..placed(self.track, start, speed_mps) };
         self.location = self.track.locate(self.car.x, self.car.y);
-        self.feel();
+        self.update_wheels();
     }
 
     /// Puts the car back on the line where it is, pointing along it, at its present speed.
@@ -121,7 +121,7 @@ impl<'a> Simulation<'a> {
         self.put(start, self.car.speed_mps);
     }
 
-    /// Rise of the ground for each metre forward.
+    /// Slope of the ground in the direction of the car: rise per metre.
     fn slope(&self) -> f64 {
         let s = &self.track.stations[self.location.station];
         let along = self.car.hx * s.tx + self.car.hy * s.ty;
@@ -132,11 +132,11 @@ impl<'a> Simulation<'a> {
     /// Moves by one step of 20 ms.
     pub fn step(&mut self, controls: Controls) {
         self.car.step(controls, self.slope(), self.wheels_off as f64 / 4.0);
-        self.arrive();
+        self.update_location();
     }
 
-    /// Finds where the car has come to, a step after it was elsewhere.
-    fn arrive(&mut self) {
+    /// Updates location, progress and time after the car has moved by one step.
+    fn update_location(&mut self) {
         let before = self.location.s_m;
         self.location = self.track.locate_near(self.car.x, self.car.y, self.location.station);
         let length = self.track.length_m;
@@ -148,11 +148,11 @@ impl<'a> Simulation<'a> {
         }
         self.progress_m += way * self.sign();
         self.steps += 1;
-        self.feel();
+        self.update_wheels();
     }
 
-    /// Finds which wheels are off the road and whether one is at a wall.
-    fn feel(&mut self) {
+    /// Counts the wheels off the road and checks whether one touches a wall.
+    fn update_wheels(&mut self) {
         (self.wheels_off, self.at_wall) = (0, false);
         for (x, y) in self.car.wheels() {
             let wheel = self.track.locate_near(x, y, self.location.station);

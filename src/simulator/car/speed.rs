@@ -7,15 +7,15 @@ use crate::simulator::car::simulation::Simulation;
 const PROPORTIONAL: f64 = 0.1;
 /// Throttle for each mph of error and second; `drive.py` adds 0.002 a frame, which is this at 20 frames a second.
 const INTEGRAL_PER_S: f64 = 0.04;
-/// Time that the first frame stands for, s.
+/// Time step of the first frame, s.
 const FIRST_FRAME_S: f64 = 0.05;
-/// Longest time that a frame stands for, s.
-const LONGEST_FRAME_S: f64 = 0.5;
-/// Sideways acceleration that `Speed::Auto` allows itself in bends, m/s².
+/// Maximum time step of a frame, s.
+const MAX_FRAME_S: f64 = 0.5;
+/// Maximum sideways acceleration of `Speed::Auto` in bends, m/s².
 const COMFORT_MPS2: f64 = 2.5;
 
-/// Speed below which nobody slows down in bends, mph.
-const SLOWEST_MPH: f64 = 9.0;
+/// Minimum speed in bends, mph.
+const MIN_BEND_MPH: f64 = 9.0;
 
 /// The speed a drive aims at.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -36,12 +36,12 @@ impl Speed {
                 let sharpest = (0..=12)
                     .map(|k| simulation.track.at(simulation.location.s_m + sign * f64::from(k) * 2.5).curvature.abs())
                     .fold(0.0, f64::max);
-                comfortable_mph(sharpest).clamp(SLOWEST_MPH, 30.0)
+                comfortable_mph(sharpest).clamp(MIN_BEND_MPH, 30.0)
             }
         }
     }
 
-    /// The speed at which runs begin, m/s.
+    /// The speed at which trials start, m/s.
     pub fn at_start_mps(self) -> f64 {
         match self {
             Speed::Fixed(mph) => mph * MPS_PER_MPH,
@@ -55,11 +55,11 @@ fn comfortable_mph(curvature: f64) -> f64 {
     (COMFORT_MPS2 / curvature.max(1e-6)).sqrt() / MPS_PER_MPH
 }
 
-/// The speed to aim at where `steering`, [-1, 1], is needed and `target_mph` wanted: less in bends, for somebody who knows
-/// the bend only by the wheel.
+/// The target speed, mph, where `steering`, [-1, 1], is needed: at most `target_mph`, less in bends. For drivers that know
+/// a bend only from their own steering.
 pub fn slower_in_bends_mph(target_mph: f64, steering: f64) -> f64 {
     let curvature = (steering * MAX_STEER_DEG).to_radians().tan().abs() / WHEELBASE_M;
-    comfortable_mph(curvature).clamp(SLOWEST_MPH.min(target_mph), target_mph)
+    comfortable_mph(curvature).clamp(MIN_BEND_MPH.min(target_mph), target_mph)
 }
 
 /// The speed as telemetry carries it: four decimals, mph.
@@ -82,7 +82,7 @@ impl SpeedController {
     /// The first frame counts for 0.05 s; a gap longer than 0.5 s for no more than that, and a
     /// clock that ran backwards for nothing.
     pub fn throttle_at(&mut self, time_s: f64, target_mph: f64, speed_mph: f64) -> f32 {
-        let dt_s = self.last_s.map_or(FIRST_FRAME_S, |last| (time_s - last).clamp(0.0, LONGEST_FRAME_S));
+        let dt_s = self.last_s.map_or(FIRST_FRAME_S, |last| (time_s - last).clamp(0.0, MAX_FRAME_S));
         self.last_s = Some(time_s);
         self.throttle(target_mph, speed_mph, dt_s) as f32
     }
@@ -109,7 +109,7 @@ mod tests {
     fn in_bends_the_speed_falls_to_a_comfortable_one_and_straight_ahead_it_does_not() {
         assert_eq!(slower_in_bends_mph(20.0, 0.0), 20.0);
         assert_eq!(slower_in_bends_mph(5.0, 1.0), 5.0);
-        assert_eq!(slower_in_bends_mph(30.0, -1.0), SLOWEST_MPH);
+        assert_eq!(slower_in_bends_mph(30.0, -1.0), MIN_BEND_MPH);
         let mph = slower_in_bends_mph(30.0, 0.2);
         let radius_m = WHEELBASE_M / 5_f64.to_radians().tan();
         assert!(((mph * MPS_PER_MPH).powi(2) / radius_m - COMFORT_MPS2).abs() < 1e-9, "{mph}");

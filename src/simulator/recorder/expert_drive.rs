@@ -60,7 +60,7 @@ impl ExpertDrive<'_> {
     }
 }
 
-/// Drives what `options` ask for and returns the rows, without pictures.
+/// Lets the expert drive as `options` say, and returns the rows, without pictures.
 pub fn drive_expert(track: &Track, options: &RecordOptions) -> Vec<Sample> {
     let mut rng = Rng::new(options.seed, "recording");
     let start = Start { reverse: options.reverse, ..Start::draw(track, options.seed) };
@@ -74,17 +74,17 @@ pub fn drive_expert(track: &Track, options: &RecordOptions) -> Vec<Sample> {
         steps_per_row: STEPS_PER_S / options.hz,
     };
     let way_m = options.laps * track.length_m;
-    let most_steps = (way_m / speed_mps.max(1.0) * 3.0) as u64 * STEPS_PER_S + 500;
+    let max_steps = (way_m / speed_mps.max(1.0) * 3.0) as u64 * STEPS_PER_S + 500;
     let mut samples = Vec::new();
     if !options.recovery {
-        expert.drive(most_steps, &mut samples, |s| s.progress_m >= way_m);
+        expert.drive(max_steps, &mut samples, |s| s.progress_m >= way_m);
         return samples;
     }
     // Every 22 m or so the car is put off its line, on alternating sides, and the way back is recorded.
     let mut s_m = start.s_m;
-    let mut gone_m = 0.0;
+    let mut driven_m = 0.0;
     let mut side = if rng.unit() < 0.5 { 1.0 } else { -1.0 };
-    while gone_m < way_m {
+    while driven_m < way_m {
         let room = track.at(s_m).width_m / 2.0 - 1.2;
         let offset_m = side * rng.between(0.7, 2.2).min(room);
         let heading_deg = rng.between(-4.0, 12.0) * side;
@@ -94,18 +94,18 @@ pub fn drive_expert(track: &Track, options: &RecordOptions) -> Vec<Sample> {
         // A pause in the names of the pictures, so that a reader sees where one stretch ends and the next begins.
         expert.simulation.steps += 2 * STEPS_PER_S;
         let step_m = rng.between(16.0, 28.0);
-        gone_m += step_m;
+        driven_m += step_m;
         s_m += if options.reverse { -step_m } else { step_m };
         side = -side;
     }
     samples
 }
 
-/// Distance from the line at which a driver who learns is put back, m: what lies beyond no longer teaches how to stay.
+/// Distance from the line at which the driver is put back, m; rows farther out teach nothing about staying on the road.
 const LOST_M: f64 = 2.2;
 
-/// Lets `driver` drive what `options` ask for and returns the rows, labelled with the expert's steering at every moment.
-/// In a share of the seconds, `expert_share`, the expert itself is at the wheel.
+/// Lets `driver` drive as `options` say, and returns the rows, labelled with the expert's steering at every moment.
+/// In a random share `expert_share` of the seconds the expert drives.
 ///
 /// # Errors
 /// If a picture cannot be encoded.
@@ -122,9 +122,9 @@ pub fn drive_and_label(
     let mut eye = FrontCamera::new(track, options.seed);
     let mut controller = SpeedController::default();
     let way_m = options.laps * track.length_m;
-    let most_steps = (way_m / speed_mps.max(1.0) * 3.0) as u64 * STEPS_PER_S + 500;
+    let max_steps = (way_m / speed_mps.max(1.0) * 3.0) as u64 * STEPS_PER_S + 500;
     let (mut samples, mut answer, mut frames, mut by_expert) = (Vec::new(), 0.0, 0, true);
-    for step in 0..most_steps {
+    for step in 0..max_steps {
         if simulation.progress_m >= way_m {
             break;
         }

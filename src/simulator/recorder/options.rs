@@ -47,7 +47,7 @@ pub struct RecordOptions {
 }
 
 impl RecordOptions {
-    /// Checks what any driver is bound to: speed and rows a second.
+    /// Checks the options that hold for every driver: speed and rows per second.
     ///
     /// # Errors
     /// [`Error::Usage`] with what would be possible.
@@ -78,7 +78,7 @@ impl Default for RecordOptions {
     }
 }
 
-/// What a recording is, beside the log.
+/// What `recording.toml` says of a recording.
 #[derive(Clone, Debug, Serialize)]
 pub struct RecordingInfo {
     /// Track as given on the command line.
@@ -106,7 +106,7 @@ pub struct RecordingInfo {
 }
 
 impl RecordingInfo {
-    /// What is said of `rows` rows that were driven as `options` ask for.
+    /// The description of `rows` rows that were driven as `options` say.
     pub fn new(track: &Track, options: &RecordOptions, rows: usize) -> RecordingInfo {
         RecordingInfo {
             track: track.name().to_string(),

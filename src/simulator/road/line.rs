@@ -27,9 +27,9 @@ pub struct Station {
     pub ty: f64,
     /// Curvature, 1/m, + = bends to the right.
     pub curvature: f64,
-    /// Rise for each metre along the line.
+    /// Slope: rise per metre along the line.
     pub slope: f64,
-    /// Fall for each metre to the right.
+    /// Banking: fall per metre to the right.
     pub crossfall: f64,
     /// Width of the road, m.
     pub width_m: f64,
@@ -208,7 +208,7 @@ impl Road {
         self.locate_at(x, y, best)
     }
 
-    /// Second-order location relative to one station: the line is taken as a circle of its curvature.
+    /// Second-order location relative to one station: approximates the line by a circle of the station's curvature.
     fn locate_at(&self, x: f64, y: f64, station: usize) -> Location {
         let s = &self.stations[station];
         let (dx, dy) = (x - s.x, y - s.y);

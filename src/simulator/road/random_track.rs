@@ -1,4 +1,4 @@
-//! Roads without end: one for every seed.
+//! Random tracks, one for every seed.
 
 use crate::simulator::math::{Rng, sin_cos};
 use crate::simulator::road::line::Road;
@@ -9,8 +9,8 @@ use crate::{Error, Result};
 
 /// Random tracks with this seed or a higher one are kept out of training.
 pub const FIRST_HELD_OUT_SEED: u64 = 1_000_000;
-/// Lines that are drawn before a seed is given up.
-const ATTEMPTS: usize = 400;
+/// Maximum number of lines drawn for one seed.
+const MAX_ATTEMPTS: usize = 400;
 
 /// The track `random:SEED`: a closed line through bends of at least 25 m radius, with its own surface, edges, land and
 /// light. Looks that only the built-in held-out tracks have are never drawn.
@@ -21,7 +21,7 @@ pub fn generate(seed: u64) -> Result<Road> {
     let mut rng = Rng::new(seed, "track");
     let spec = looks(seed, &mut rng);
     let mut reason = None;
-    for _ in 0..ATTEMPTS {
+    for _ in 0..MAX_ATTEMPTS {
         let mut spec = spec.clone();
         spec.points = line(&mut rng);
         match Road::from_spec(spec, &format!("random:{seed}")) {
@@ -33,7 +33,7 @@ pub fn generate(seed: u64) -> Result<Road> {
         }
     }
     let reason = reason.map(|e| e.to_string()).unwrap_or_default();
-    Err(Error::Usage(format!("random:{seed}: no line found in {ATTEMPTS} attempts ({reason}); take another seed")))
+    Err(Error::Usage(format!("random:{seed}: no line found in {MAX_ATTEMPTS} attempts ({reason}); take another seed")))
 }
 
 /// Control points around a circle with random radii, scaled to a random length.

@@ -19,7 +19,7 @@ pub struct TrackSpec {
     /// Control points of a closed uniform cubic B-spline, at least 6:
     /// `[x m, y m, z m, road width m, bank deg]`, bank > 0 where the right side is lower.
     pub points: Vec<[f64; 5]>,
-    /// The looks of road that stretches refer to by name; the first one is used where no stretch says otherwise.
+    /// Looks of the road, which stretches refer to by name; the first one applies where no stretch names another.
     pub look: Vec<Look>,
     /// What differs along the lap; later stretches override earlier ones.
     #[serde(default)]
@@ -31,7 +31,7 @@ pub struct TrackSpec {
 }
 
 impl TrackSpec {
-    /// Checks all that can be told without the line itself.
+    /// Checks everything that does not need the reference line.
     ///
     /// # Errors
     /// A sentence that names the entry, what it must be, and the remedy.
@@ -338,7 +338,7 @@ pub struct Light {
     pub sun_azimuth_deg: f64,
     /// Height of the sun above the horizon, deg, 5 to 85.
     pub sun_elevation_deg: f64,
-    /// Light that reaches shadows, 0.1 to 1.
+    /// Brightness of shadows relative to full sunlight, 0.1 to 1.
     pub shade: f32,
     /// Colour of sunlight; 255 is neutral.
     pub sun: Rgb,
@@ -346,7 +346,7 @@ pub struct Light {
     pub zenith: Rgb,
     /// Sky at the horizon.
     pub horizon: Rgb,
-    /// Distance at which air hides half of a thing, m.
+    /// Distance at which haze hides half of an object, m.
     pub haze_m: f32,
     /// Strength of clouds, 0 (clear) to 1.
     #[serde(default)]

@@ -1,25 +1,25 @@
-//! What differs from run to run on the same track: light and texture.
+//! Light and texture of a trial; the seed draws both.
 
 use crate::simulator::math::Rng;
 use crate::simulator::scenery::terrain::FULL_LIGHT;
 use crate::simulator::scenery::texel::pack;
 use crate::simulator::scenery::world::World;
 
-/// The light and texture of one run. Variant 0 of a track is what its file says; other seeds depart from it.
+/// The light and texture of one trial. Seed 0 takes them from the track file; other seeds vary them.
 #[derive(Clone, Debug)]
 pub struct Variant {
-    /// Moves the road's pattern along the road, m.
+    /// Shift of the road texture along the road, m.
     pub road_shift_m: f32,
     /// Factor (256 = 1, never more) of the road's colour for each value of the land's light.
     pub road_light: [u16; 256],
     /// Colour of distant air, `0x__BBGGRR`.
     pub haze: u32,
-    /// Final value for each red, green and blue.
+    /// Tone curves of red, green and blue, applied last.
     pub tone: [[u8; 256]; 3],
 }
 
 impl Variant {
-    /// The variant that the run `seed` sees: brightness ±15 %, contrast ±12 %, colour ±5 % a channel, road ±12 %, depth of
+    /// The variant of the trial `seed`: brightness ±15 %, contrast ±12 %, colour ±5 % a channel, road ±12 %, depth of
     /// shadows ±25 %. Seed 0 is the track as its file says.
     pub fn new(world: &World, seed: u64) -> Variant {
         let mut rng = Rng::new(seed, "light");

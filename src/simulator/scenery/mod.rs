@@ -1,4 +1,4 @@
-//! What stands and lies beside the road, and the light on it.
+//! The visible world: land, road surface, sky, objects beside the road, and the light on them.
 
 pub mod light;
 pub(crate) mod pictures;

@@ -1,4 +1,4 @@
-//! Pictures of what stands beside the road, painted by rule, with smaller copies for far away.
+//! Procedural pictures of the objects beside the road, with mipmaps for distant ones.
 
 use crate::simulator::math::{hash2, value_noise};
 use crate::simulator::road::spec::Plant;
@@ -9,13 +9,13 @@ const W: usize = 64;
 /// Height of a picture, texels.
 const H: usize = 128;
 
-/// One thing's picture: texels `0xAABBGGRR`, alpha at or above 128 is solid.
+/// The picture of one object: texels `0xAABBGGRR`, alpha at or above 128 is solid.
 pub struct Picture {
     /// Finest first; each half as wide and high as the one before.
     levels: Vec<PictureLevel>,
-    /// Width of the thing, m.
+    /// Width of the object, m.
     pub width_m: f32,
-    /// Height of the thing, m.
+    /// Height of the object, m.
     pub height_m: f32,
 }
 
@@ -43,7 +43,7 @@ impl PictureLevel {
 }
 
 impl Picture {
-    /// The level fit for a thing `pixels` high in the picture.
+    /// The level for an object that is `pixels` high in the frame.
     pub fn level(&self, pixels: f32) -> &PictureLevel {
         let mut k = 0;
         while k + 1 < self.levels.len() && (H >> k) as f32 > pixels * 1.5 {
@@ -85,7 +85,7 @@ impl Picture {
                     let four = [0, 1, 2 * w, 2 * w + 1].map(|o| fine[2 * v * 2 * w + 2 * u + o]);
                     let weight: u32 = four.iter().map(|t| t >> 24).sum();
                     let channel = |s: u32| four.iter().map(|t| (t >> s & 255) * (t >> 24)).sum::<u32>() / weight.max(1);
-                    // More than the mean, so that thin trunks do not vanish from afar.
+                    // More than the mean, so that thin trunks stay visible at a distance.
                     channel(0) | channel(8) << 8 | channel(16) << 16 | (weight * 2 / 5).min(255) << 24
                 })
                 .collect();

@@ -25,9 +25,9 @@ const LEVELS: usize = LOG2_SIZE as usize + 1;
 pub struct RoadTexture {
     texels: Vec<u32>,
     offsets: [[u32; LEVELS]; LEVELS],
-    /// Places across between which there is only road.
+    /// Range of across coordinates where the road covers the land completely.
     paved: Range<i32>,
-    /// Places across between which there is any road.
+    /// Range of across coordinates where the road covers any land.
     covered: Range<i32>,
 }
 
@@ -35,14 +35,14 @@ pub struct RoadTexture {
 #[derive(Clone, Copy)]
 pub struct Level<'a> {
     texels: &'a [u32],
-    /// Shifts that bring fixed-point places to texels of this level.
+    /// Right shifts from fixed-point coordinates to texels of this level.
     along_shift: u32,
     across_shift: u32,
     along_mask: usize,
     log2_across: u32,
 }
 
-/// Bits behind the point of fixed-point places along the road; the unit is the finest texel. With these a whole lap of
+/// Fraction bits of fixed-point coordinates along the road; the unit is the finest texel. With these a lap of
 /// 1,500 m stays below 2^22, which [`fixed`](crate::simulator::scenery::texel::fixed) needs.
 const ALONG_BITS: u32 = 6;
 /// The same across the road.
@@ -51,7 +51,7 @@ const ACROSS_BITS: u32 = 12;
 pub const ALONG_UNITS_PER_M: f32 = (SIZE << ALONG_BITS) as f32 / PERIOD_M;
 /// Fixed-point units for each metre across.
 pub const ACROSS_UNITS_PER_M: f32 = (SIZE << ACROSS_BITS) as f32 / (2.0 * HALF_M);
-/// Places across at or above this are beyond the texture.
+/// Across coordinates at or above this lie beyond the texture.
 pub const ACROSS_UNITS: u32 = (SIZE << ACROSS_BITS) as u32;
 
 impl Level<'_> {
@@ -126,17 +126,17 @@ impl RoadTexture {
 /// wider texels of coarser levels.
 fn extent(texels: &[u32]) -> (Range<i32>, Range<i32>) {
     const ROOM: usize = SIZE / 64;
-    let (mut least, mut most) = ([255; SIZE], [0; SIZE]);
+    let (mut min, mut max) = ([255; SIZE], [0; SIZE]);
     for row in texels.chunks_exact(SIZE) {
-        for ((least, most), texel) in least.iter_mut().zip(&mut most).zip(row) {
-            *least = texel.to_be_bytes()[0].min(*least);
-            *most = texel.to_be_bytes()[0].max(*most);
+        for ((min, max), texel) in min.iter_mut().zip(&mut max).zip(row) {
+            *min = texel.to_be_bytes()[0].min(*min);
+            *max = texel.to_be_bytes()[0].max(*max);
         }
     }
-    let left = least[..SIZE / 2].iter().rposition(|a| *a < 255).map_or(0, |v| v + 1);
-    let right = least[SIZE / 2..].iter().position(|a| *a < 255).map_or(SIZE, |v| v + SIZE / 2);
-    let first = most.iter().position(|a| *a > 0).unwrap_or(SIZE / 2);
-    let last = most.iter().rposition(|a| *a > 0).map_or(SIZE / 2, |v| v + 1);
+    let left = min[..SIZE / 2].iter().rposition(|a| *a < 255).map_or(0, |v| v + 1);
+    let right = min[SIZE / 2..].iter().position(|a| *a < 255).map_or(SIZE, |v| v + SIZE / 2);
+    let first = max.iter().position(|a| *a > 0).unwrap_or(SIZE / 2);
+    let last = max.iter().rposition(|a| *a > 0).map_or(SIZE / 2, |v| v + 1);
     let fixed = |v: usize| (v << ACROSS_BITS) as i32;
     (
         fixed(left + ROOM)..fixed(right.saturating_sub(ROOM)),
@@ -176,13 +176,13 @@ fn grain(along: f32, across: f32, size_m: f32, stretch: f32, seed: u32) -> f32 {
     value_noise(along * cells / PERIOD_M, (across + HALF_M) / size_m, Some((cells as i32, wide as i32 + 1)), seed) - 0.5
 }
 
-/// A ragged border never departs farther from the edge, m.
-const MOST_RAGGED_M: f32 = 0.8;
+/// Maximum distance of a ragged border from the edge, m.
+const MAX_RAGGED_M: f32 = 0.8;
 
 fn paint_texel(look: &Look, along: f32, across: f32, sun: [f32; 3], seed: u32) -> u32 {
     let edge = if across < 0.0 { look.left } else { look.right };
     let out = across.abs() - HALF_ROAD_M;
-    // Noise is the dearest here, so each is taken only where it shows.
+    // Noise is the most expensive part, so it is computed only where it shows.
     let (kerb_m, kerb) = match edge {
         Edge::Kerb => {
             let red = along.rem_euclid(1.5) < 0.75;
@@ -192,7 +192,7 @@ fn paint_texel(look: &Look, along: f32, across: f32, sun: [f32; 3], seed: u32) -
         _ => (0.0, [0.0; 3]),
     };
     let ragged = match edge {
-        _ if (out - kerb_m).abs() > MOST_RAGGED_M => 0.0,
+        _ if (out - kerb_m).abs() > MAX_RAGGED_M => 0.0,
         Edge::Overgrown => {
             1.1 * grain(along, across, 0.7, 1.0, seed + 7) + 0.5 * grain(along, across, 0.12, 1.0, seed + 8)
         }

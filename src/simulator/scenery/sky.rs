@@ -1,4 +1,4 @@
-//! The sky and the hills on the horizon, as one picture around the whole world.
+//! The sky and the hills on the horizon, as one panorama.
 
 use crate::simulator::math::{hash2, lerp, smoothstep, value_noise};
 use crate::simulator::road::line::Road;
@@ -8,12 +8,12 @@ use crate::simulator::scenery::texel::{clip, fixed, pack};
 pub const AROUND: usize = 2048;
 /// Texels from the lowest to the highest direction.
 const UP: usize = 176;
-/// Tangent of the lowest elevation.
-const LOWEST: f32 = -0.12;
+/// Tangent of the minimum elevation.
+const MIN_TANGENT: f32 = -0.12;
 /// Texels for each unit of the tangent of the elevation.
 const PER_TANGENT: f32 = 160.0;
 
-/// A picture of all directions above the horizon.
+/// A panorama of all directions above the horizon.
 pub struct Sky {
     texels: Vec<u32>,
 }
@@ -43,7 +43,7 @@ impl Sky {
             let near = 0.02 + 0.16 * scale * ridge(9, 50) + tops;
             let far = 0.03 + 0.24 * scale * ridge(14, 70);
             for j in 0..UP {
-                let tangent = LOWEST + (j as f32 + 0.5) / PER_TANGENT;
+                let tangent = MIN_TANGENT + (j as f32 + 0.5) / PER_TANGENT;
                 let up = smoothstep(-0.05, 0.62, tangent);
                 let mut c: [f32; 3] = std::array::from_fn(|k| lerp(horizon[k], zenith[k], up));
                 if light.clouds > 0.0 && tangent > 0.0 {
@@ -75,10 +75,10 @@ impl Sky {
     }
 }
 
-/// Bits behind the point of a [`SkyPlace`].
+/// Fraction bits of a [`SkyPlace`].
 const FRACTION_BITS: u32 = 9;
 
-/// A place on the picture, or the way between two, in fixed-point texels.
+/// A position in the panorama, or an offset between two, in fixed-point texels.
 #[derive(Clone, Copy)]
 pub struct SkyPlace {
     around: i32,
@@ -90,7 +90,7 @@ impl SkyPlace {
     #[inline(always)]
     pub fn new(around: f32, tangent: f32) -> SkyPlace {
         let one = (1 << FRACTION_BITS) as f32;
-        let up = clip((tangent - LOWEST) * PER_TANGENT, UP as f32 - 1.0);
+        let up = clip((tangent - MIN_TANGENT) * PER_TANGENT, UP as f32 - 1.0);
         SkyPlace { around: fixed((around + 0.5) * one), up: fixed((up + 0.5) * one) }
     }
 

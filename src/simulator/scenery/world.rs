@@ -1,4 +1,4 @@
-//! Everything there is to see on a track, prepared once so that a picture needs only look-ups.
+//! The visible world of a track, prepared once so that rendering only looks values up.
 
 use crate::simulator::math::{Rng, Vec3, lerp, sin_cos, smoothstep, value_noise, vec3};
 use crate::simulator::road::line::{Road, Station, WALL_GAP_M};
@@ -23,13 +23,13 @@ pub struct RoadCell {
     pub curvature: f32,
     /// Place along the texture, m; runs from 0 to a whole number of periods.
     pub along_m: f32,
-    /// Texture metres for each metre to the right.
+    /// Metres of texture per metre to the right.
     pub across_scale: f32,
     /// Index of the look.
     pub look: u32,
 }
 
-/// A thing that stands upright and always faces the camera.
+/// A billboard: an upright picture that always faces the camera.
 pub struct Sprite {
     /// Foot in the world.
     pub foot: Vec3,
@@ -39,7 +39,7 @@ pub struct Sprite {
     pub scale: f32,
     /// Light that falls on it, 1 = full sun.
     pub light: f32,
-    /// Seen in a mirror.
+    /// Whether the picture is mirrored.
     pub mirrored: bool,
 }
 
@@ -51,7 +51,7 @@ pub struct WallPiece {
     pub to: Vec3,
     /// Kind.
     pub wall: Wall,
-    /// Metres along the wall at `from`.
+    /// Distance along the wall at `from`, m.
     pub along_m: f32,
     /// Light that falls on it.
     pub light: f32,
@@ -69,7 +69,7 @@ pub struct World {
     pub road_length_m: f32,
     /// Surface of each look.
     pub textures: Vec<RoadTexture>,
-    /// Things beside the road.
+    /// Objects beside the road.
     pub sprites: Vec<Sprite>,
     /// Their pictures.
     pub pictures: Vec<Picture>,
@@ -79,7 +79,7 @@ pub struct World {
     pub sky: Sky,
     /// Colour of distant air.
     pub haze: [f32; 3],
-    /// Distance at which air hides half, m.
+    /// Distance at which haze hides half of an object, m.
     pub haze_m: f32,
 }
 

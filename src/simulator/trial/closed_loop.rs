@@ -1,4 +1,4 @@
-//! The course of a run, one step at a time: what a driver in this process and one at the end of a wire have in common.
+//! A trial, step by step: the same for a driver in this process and for one behind a connection.
 
 use std::collections::VecDeque;
 
@@ -14,16 +14,17 @@ const OFF_ROAD_LIMIT_S: f64 = 1.0;
 /// Longest time standing still, s.
 const STANDING_LIMIT_S: f64 = 10.0;
 
-/// A car on its way: frames fall due at 20 Hz, answers go to the wheels, steps move the car, and the run is judged.
+/// A trial under way: frames are due at 20 Hz, the driver's answers set the controls, steps move the car, and a failure ends
+/// the trial.
 pub struct ClosedLoop<'a> {
     simulation: Simulation<'a>,
     options: TrialOptions,
     noise: SteeringNoise,
-    /// Steering on its way to the wheels: the step at which it arrives, and its value.
+    /// Delayed steering: the step at which it takes effect, and its value.
     pending: VecDeque<(u64, f64)>,
     latency_steps: u64,
-    way_m: f64,
-    most_steps: u64,
+    distance_m: f64,
+    max_steps: u64,
     controls: Controls,
     /// Step of the last frame, and frames so far.
     shown: u64,
@@ -33,22 +34,22 @@ pub struct ClosedLoop<'a> {
     off_steps: u64,
     standing_steps: u64,
     put_back: bool,
-    run: Trial,
+    trial: Trial,
 }
 
 impl<'a> ClosedLoop<'a> {
-    /// A run whose start and noise `seed` draws.
+    /// A trial whose start and noise `seed` draws.
     pub fn new(track: &'a Track, options: &TrialOptions, seed: u64) -> ClosedLoop<'a> {
         let simulation = Simulation::new(track, Start::draw(track, seed), options.speed.at_start_mps());
-        let way_m = options.laps as f64 * track.length_m;
+        let distance_m = options.laps as f64 * track.length_m;
         let slowest_mps = 0.25 * options.speed.at_start_mps().max(2.0);
         ClosedLoop {
             options: *options,
             noise: SteeringNoise::new(seed, options.noise),
             pending: VecDeque::new(),
             latency_steps: (options.latency_ms / 1000.0 * STEPS_PER_S as f64).round() as u64,
-            way_m,
-            most_steps: ((way_m / slowest_mps + 60.0) * STEPS_PER_S as f64) as u64,
+            distance_m,
+            max_steps: ((distance_m / slowest_mps + 60.0) * STEPS_PER_S as f64) as u64,
             controls: Controls::default(),
             shown: 0,
             frames: 0,
@@ -56,7 +57,7 @@ impl<'a> ClosedLoop<'a> {
             off_steps: 0,
             standing_steps: 0,
             put_back: false,
-            run: Trial { worst_cte_m: simulation.cte_m().abs(), ..Trial::default() },
+            trial: Trial { worst_cte_m: simulation.cte_m().abs(), ..Trial::default() },
             simulation,
         }
     }
@@ -73,29 +74,31 @@ impl<'a> ClosedLoop<'a> {
 
     /// The moment of the last answer.
     pub fn last_moment(&self) -> Option<&Moment> {
-        self.run.moments.last()
+        self.trial.moments.last()
     }
 
     /// Times the car was put back so far.
     pub fn interventions(&self) -> usize {
-        self.run.interventions
+        self.trial.interventions
     }
 
-    /// Share of the way that is made, 0 to 1.
+    /// Share of the distance that is driven, 0 to 1.
     pub fn share(&self) -> f64 {
-        (self.simulation.progress_m / self.way_m).clamp(0.0, 1.0)
+        (self.simulation.progress_m / self.distance_m).clamp(0.0, 1.0)
     }
 
     /// Whether there is more to drive: not all laps, no failure, and not far too slow.
     pub fn goes_on(&self) -> bool {
-        self.simulation.progress_m < self.way_m && self.simulation.steps < self.most_steps && self.run.failure.is_none()
+        self.simulation.progress_m < self.distance_m
+            && self.simulation.steps < self.max_steps
+            && self.trial.failure.is_none()
     }
 
-    /// Whether the run ends because it has taken far longer than a slow car needs.
+    /// Whether the trial ended because it took far longer than a slow car needs.
     pub fn is_too_slow(&self) -> bool {
-        self.simulation.progress_m < self.way_m
-            && self.simulation.steps >= self.most_steps
-            && self.run.failure.is_none()
+        self.simulation.progress_m < self.distance_m
+            && self.simulation.steps >= self.max_steps
+            && self.trial.failure.is_none()
     }
 
     /// Whether a frame is to be answered before the next step.
@@ -110,12 +113,12 @@ impl<'a> ClosedLoop<'a> {
         let steering = sane(steering);
         if self.frames > 0 {
             let change = (steering - self.steering) * MAX_STEER_DEG;
-            self.run.whiteness_sum += change * change / dt_s;
+            self.trial.whiteness_sum += change * change / dt_s;
         }
         self.steering = steering;
         self.pending.push_back((step + self.latency_steps, steering + self.noise.next(dt_s)));
         self.controls.throttle = sane(throttle);
-        self.run.moments.push(Moment {
+        self.trial.moments.push(Moment {
             time_s: self.simulation.time_s(),
             x: self.simulation.car.x,
             y: self.simulation.car.y,
@@ -130,13 +133,13 @@ impl<'a> ClosedLoop<'a> {
         (self.shown, self.frames) = (step, self.frames + 1);
     }
 
-    /// Hands commands to the car between frames: both act at once, and what was on its way is forgotten.
+    /// Applies commands between frames: both act at once, and delayed steering is discarded.
     pub fn take_up(&mut self, steering: f32, throttle: f32) {
         self.pending.clear();
         self.controls = Controls { steering: sane(steering), throttle: sane(throttle) };
     }
 
-    /// Moves the car by one step and judges where it is.
+    /// Moves the car by one step and checks for failures and interventions.
     pub fn step(&mut self) {
         let step = self.simulation.steps;
         while self.pending.front().is_some_and(|(at, _)| *at <= step) {
@@ -148,36 +151,36 @@ impl<'a> ClosedLoop<'a> {
         let off = self.simulation.wheels_off > 2;
         self.off_steps = if off { self.off_steps + 1 } else { 0 };
         self.standing_steps = if self.simulation.car.speed_mps < 0.1 { self.standing_steps + 1 } else { 0 };
-        self.run.off_road_s += if off { STEP_S } else { 0.0 };
-        self.run.worst_cte_m = self.run.worst_cte_m.max(cte_m);
+        self.trial.off_road_s += if off { STEP_S } else { 0.0 };
+        self.trial.worst_cte_m = self.trial.worst_cte_m.max(cte_m);
         if self.options.assisted {
             if cte_m > INTERVENTION_M {
-                self.run.interventions += 1;
+                self.trial.interventions += 1;
                 self.simulation.put_back();
                 self.pending.clear();
                 self.controls.steering = 0.0;
                 self.put_back = true;
             }
         } else if self.simulation.at_wall {
-            self.run.failure = Some(Failure::Crash);
+            self.trial.failure = Some(Failure::Crash);
         } else if self.off_steps as f64 * STEP_S > OFF_ROAD_LIMIT_S {
-            self.run.failure = Some(Failure::LeftRoad);
+            self.trial.failure = Some(Failure::LeftRoad);
         } else if self.standing_steps as f64 * STEP_S > STANDING_LIMIT_S {
-            self.run.failure = Some(Failure::StoodStill);
+            self.trial.failure = Some(Failure::StoodStill);
         }
     }
 
-    /// What the run came to.
+    /// Ends the trial.
     pub fn finish(mut self) -> Trial {
-        self.run.time_s = self.simulation.time_s();
-        self.run.distance_m = self.simulation.progress_m.max(0.0);
-        let laps = (self.run.distance_m / self.simulation.track.length_m + 1e-9) as usize;
-        self.run.laps_completed = laps.min(self.options.laps);
-        self.run
+        self.trial.time_s = self.simulation.time_s();
+        self.trial.distance_m = self.simulation.progress_m.max(0.0);
+        let laps = (self.trial.distance_m / self.simulation.track.length_m + 1e-9) as usize;
+        self.trial.laps_completed = laps.min(self.options.laps);
+        self.trial
     }
 }
 
-/// A driver that answers nonsense steers straight ahead and rolls.
+/// The command clamped to [-1, 1]; 0, straight ahead and rolling, for NaN and infinity.
 fn sane(command: f32) -> f64 {
     if command.is_finite() { f64::from(command).clamp(-1.0, 1.0) } else { 0.0 }
 }

@@ -1,4 +1,4 @@
-//! Many closed-loop runs of one driver on one track, and the comparison of two drivers.
+//! Many trials of one driver on one track, and the comparison of two drivers.
 
 use std::time::Instant;
 
@@ -9,14 +9,14 @@ use crate::simulator::car::speed::Speed;
 use crate::simulator::track::Track;
 use crate::simulator::trial::driver::{Driver, Expert};
 use crate::simulator::trial::event::DriveEvent;
-use crate::simulator::trial::outcome::{Failure, INTERVENTION_M, INTERVENTION_S, Trial, line_errors_m};
+use crate::simulator::trial::outcome::{Failure, INTERVENTION_M, Trial, autonomy_percent, line_errors_m};
 use crate::simulator::trial::run::{run_trial, run_trial_observed};
 use crate::simulator::trial::statistics::{PairedTest, wilson_interval};
 use crate::simulator::trial::summary::{DriveOptions, DriveResult, DriveSummary, TrialPair};
 use crate::{Error, Result};
 
-/// Drives every seed of `options` twice, free and assisted, runs in parallel; results do not depend on the number of
-/// threads. `new_driver` makes a fresh driver for a run.
+/// Drives every seed of `options` twice, free and assisted, with trials in parallel; results do not depend on the number of
+/// threads. `new_driver` makes a fresh driver for each trial.
 ///
 /// # Errors
 /// Impossible options, a driver that cannot be made, and the observer's own.
@@ -42,7 +42,7 @@ where
     Ok(put_together(track, options, measured, rayon::current_num_threads()))
 }
 
-/// As [`drive`], to the same bits, but one run after the other, telling `observer` every frame.
+/// As [`drive`], to the same bits, but one trial after the other; `observer` is told every frame.
 ///
 /// # Errors
 /// As [`drive`], and the observer's own.
@@ -94,7 +94,7 @@ where
     let began = Instant::now();
     let free = go(false)?;
     let mut simulated_s = free.time_s;
-    // A run that nobody would have interrupted is the same with help as without.
+    // A trial without an intervention is the same with help as without.
     let assisted = if free.failure.is_none() && free.worst_cte_m <= INTERVENTION_M {
         free.clone()
     } else {
@@ -146,11 +146,9 @@ fn summarise(track: &Track, options: &DriveOptions, runs: &[TrialPair]) -> Drive
     let free = || runs.iter().flat_map(|r| &r.free.moments);
     let [cte_mean_m, cte_rms_m, cte_p95_m] = line_errors_m(free());
     let time_s = sum(&|r| r.free.time_s).max(1e-9);
-    let assisted_s = sum(&|r| r.assisted.time_s).max(1e-9);
     let interventions: usize = runs.iter().map(|r| r.assisted.interventions).sum();
     let whole = runs.iter().filter(|r| r.free.laps_completed == options.laps).count();
     let (completed_low, completed_high) = wilson_interval(whole, runs.len());
-    let charged = INTERVENTION_S * interventions as f64;
     DriveSummary {
         track: track.name().to_string(),
         held_out: track.held_out(),
@@ -160,7 +158,7 @@ fn summarise(track: &Track, options: &DriveOptions, runs: &[TrialPair]) -> Drive
         laps_total: runs.len() * options.laps,
         completed_low,
         completed_high,
-        autonomy_percent: (100.0 * (1.0 - charged / assisted_s)).max(0.0),
+        autonomy_percent: autonomy_percent(interventions, sum(&|r| r.assisted.time_s)),
         interventions,
         interventions_per_km: interventions as f64 / (sum(&|r| r.assisted.distance_m) / 1000.0).max(1e-9),
         distance_m: sum(&|r| r.free.distance_m),
@@ -222,6 +220,11 @@ mod tests {
         assert!((s.mean_speed_mph - 20.0).abs() < 1.0, "{}", s.mean_speed_mph);
         assert!((s.whiteness_deg_s - s.expert_whiteness_deg_s).abs() < 1e-9);
         assert_eq!(zero.summary.laps_completed, 0);
+        // NVIDIA (2016) charges 6 s for each intervention.
+        let assisted_s: f64 = zero.trials.iter().map(|pair| pair.assisted.time_s).sum();
+        let charged_s = 6.0 * zero.summary.interventions as f64;
+        assert!(zero.summary.interventions > 8 && charged_s < assisted_s, "{charged_s} s of {assisted_s} s");
+        assert!((zero.summary.autonomy_percent - 100.0 * (1.0 - charged_s / assisted_s)).abs() < 1e-9);
         assert!(zero.summary.autonomy_percent < 90.0 && zero.summary.interventions_per_km > 3.0);
         let tests = compare(&zero, &expert).unwrap();
         assert!(tests[0].significant() && tests[0].mean_b > tests[0].mean_a && tests[1].significant());

@@ -1,4 +1,4 @@
-//! Looking over a driver's shoulder: every frame of a run, for videos and live pages.
+//! The events of a trial, for videos and live pages.
 
 use std::time::Duration;
 
@@ -6,13 +6,13 @@ use crate::simulator::camera::pinhole::RgbFrame;
 use crate::simulator::car::simulation::Simulation;
 use crate::simulator::trial::outcome::TrialOptions;
 
-/// What there is to see at one frame of a run, after the driver has answered it and before the car moves on.
+/// One frame of a trial, after the driver has answered it and before the car moves.
 pub struct DriveFrame<'a> {
     /// The camera's picture, 320x160, after JPEG: what the driver saw, or would have seen if it looked.
     pub picture: &'a RgbFrame,
     /// The car on its track: place, direction, cross-track error, wheels off the road, time.
     pub simulation: &'a Simulation<'a>,
-    /// How the run is driven.
+    /// How the trial is driven.
     pub options: &'a TrialOptions,
     /// The driver's steering, [-1, 1], + = right.
     pub steering: f64,
@@ -24,7 +24,7 @@ pub struct DriveFrame<'a> {
     pub speed_mph: f64,
     /// Whether the car was put back since the last frame.
     pub put_back: bool,
-    /// Times the car was put back so far; 0 in a free run.
+    /// Times the car was put back so far; 0 in a free trial.
     pub interventions: usize,
     /// How long the driver took to answer; the one entry that differs between runs.
     pub answered_in: Duration,
@@ -38,10 +38,10 @@ impl DriveFrame<'_> {
     }
 }
 
-/// What happens in a run. Observers change nothing of the run, except that they may end it.
+/// What happens in a trial. Observers cannot change a trial, but may end it.
 #[derive(Clone, Copy)]
 pub enum DriveEvent<'a> {
-    /// A run begins.
+    /// A trial begins.
     Begin {
         /// What draws its start, light and noise.
         seed: u64,

@@ -6,12 +6,12 @@ use crate::statistics::quantile;
 
 /// Frames that a driver sees in each second. At 50 steps a second they come after 3 and 2 steps in turn.
 pub const DRIVE_HZ: u64 = 20;
-/// Distance from the line at which an assisted run is interrupted, m (NVIDIA 2016).
+/// Distance from the line at which the car of an assisted trial is put back, m (NVIDIA 2016).
 pub const INTERVENTION_M: f64 = 1.0;
 /// Time charged for an intervention, s (NVIDIA 2016).
 pub const INTERVENTION_S: f64 = 6.0;
 
-/// Why a free run ended early.
+/// Why a free trial ended early.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Failure {
@@ -23,7 +23,7 @@ pub enum Failure {
     StoodStill,
 }
 
-/// One moment of a run, taken when a frame is shown.
+/// The state of a trial at one frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Moment {
     /// Time since the start, s.
@@ -48,22 +48,22 @@ pub struct Moment {
     pub intervention: bool,
 }
 
-/// What one run of a driver came to.
+/// The result of one trial of a driver.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Trial {
     /// Moments at 20 Hz.
     pub moments: Vec<Moment>,
     /// Whole laps driven.
     pub laps_completed: usize,
-    /// Way made along the line, m.
+    /// Distance driven along the line, m.
     pub distance_m: f64,
     /// Simulated time, s.
     pub time_s: f64,
     /// Time with more than two wheels off the road, s.
     pub off_road_s: f64,
-    /// Why the run ended early; never in an assisted run.
+    /// Why the trial ended early; always `None` in an assisted trial.
     pub failure: Option<Failure>,
-    /// Times the car was put back; 0 in a free run.
+    /// Times the car was put back; 0 in a free trial.
     pub interventions: usize,
     /// Largest distance from the line at any step, m.
     pub worst_cte_m: f64,
@@ -72,9 +72,9 @@ pub struct Trial {
 }
 
 impl Trial {
-    /// Share of the time in which nobody had to help, %: `(1 - 6 s * interventions / time) * 100`, not below 0.
+    /// [`autonomy_percent`] of the trial.
     pub fn autonomy_percent(&self) -> f64 {
-        (100.0 * (1.0 - INTERVENTION_S * self.interventions as f64 / self.time_s.max(STEP_S))).max(0.0)
+        autonomy_percent(self.interventions, self.time_s)
     }
 
     /// Root mean square rate of the steering, deg/s.
@@ -88,7 +88,13 @@ impl Trial {
     }
 }
 
-/// Distance from the line over the moments of runs: mean, root mean square and 95th percentile, m.
+/// Autonomy (NVIDIA 2016): share of `time_s` without help, where each intervention is charged 6 s:
+/// `100 (1 - 6 s * interventions / time_s)` %, at least 0.
+pub fn autonomy_percent(interventions: usize, time_s: f64) -> f64 {
+    (100.0 * (1.0 - INTERVENTION_S * interventions as f64 / time_s.max(STEP_S))).max(0.0)
+}
+
+/// Distance from the line over the moments of trials: mean, root mean square and 95th percentile, m.
 pub fn line_errors_m<'a>(moments: impl Iterator<Item = &'a Moment>) -> [f64; 3] {
     let mut errors: Vec<f64> = moments.map(|m| m.cte_m.abs()).collect();
     errors.sort_by(f64::total_cmp);
@@ -97,7 +103,7 @@ pub fn line_errors_m<'a>(moments: impl Iterator<Item = &'a Moment>) -> [f64; 3] 
     [errors.iter().sum::<f64>() / n, rms, quantile(&errors, 0.95)]
 }
 
-/// How a run is driven.
+/// How a trial is driven.
 #[derive(Clone, Copy, Debug)]
 pub struct TrialOptions {
     /// Laps to drive.
@@ -108,6 +114,6 @@ pub struct TrialOptions {
     pub latency_ms: f64,
     /// Standard deviation of a disturbance of the steering, [-1, 1].
     pub noise: f64,
-    /// Put the car back when it is too far from the line, instead of ending the run when it fails.
+    /// Put the car back when it is too far from the line, instead of ending the trial when it fails.
     pub assisted: bool,
 }

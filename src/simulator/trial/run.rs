@@ -14,7 +14,7 @@ use crate::simulator::trial::driver::{DriveState, Driver};
 use crate::simulator::trial::event::{DriveEvent, DriveFrame};
 use crate::simulator::trial::outcome::{Trial, TrialOptions};
 
-/// Drives one run whose start, light and noise `seed` draws.
+/// Drives one trial whose start, light and noise `seed` draws.
 ///
 /// # Errors
 /// If a picture cannot be encoded.
@@ -22,7 +22,7 @@ pub fn run_trial(track: &Track, driver: &mut dyn Driver, options: &TrialOptions,
     drive_run(track, driver, options, seed, None)
 }
 
-/// As [`run_trial`], to the same bits, telling `observer` every frame. Pictures are taken even if the driver does not look.
+/// As [`run_trial`], to the same bits; `observer` is told every frame. Frames are rendered even if the driver does not look at them.
 ///
 /// # Errors
 /// If a picture cannot be encoded, or the observer's own.

@@ -8,9 +8,9 @@ use crate::simulator::trial::outcome::{Trial, TrialOptions};
 /// How a driver is put to the test.
 #[derive(Clone, Debug)]
 pub struct DriveOptions {
-    /// Laps of each run.
+    /// Laps of each trial.
     pub laps: usize,
-    /// Runs; run `k` has seed `seed + k`.
+    /// Number of trials; trial `k` has seed `seed + k`.
     pub runs: usize,
     /// First seed.
     pub seed: u64,
@@ -29,7 +29,7 @@ impl Default for DriveOptions {
 }
 
 impl DriveOptions {
-    /// How a run of the drive is driven, free or assisted.
+    /// How a trial of the drive is driven, free or assisted.
     pub fn trial_options(&self, assisted: bool) -> TrialOptions {
         let DriveOptions { laps, speed, latency_ms, noise, .. } = *self;
         TrialOptions { laps, speed, latency_ms, noise, assisted }
@@ -54,7 +54,7 @@ pub struct DriveSummary {
     pub track: String,
     /// Whether training must not see the track.
     pub held_out: bool,
-    /// Held-out tracks that the driver was trained on all the same; whoever knows the driver sets it.
+    /// Held-out tracks that the driver was trained on all the same; the caller, who knows the driver, sets them.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub trained_on_held_out: Vec<String>,
     /// Seeds driven.
@@ -67,13 +67,13 @@ pub struct DriveSummary {
     pub completed_low: f64,
     /// See `completed_low`.
     pub completed_high: f64,
-    /// Share of the assisted time in which nobody had to help, %.
+    /// Autonomy over the assisted trials, %, see [`autonomy_percent`](super::outcome::autonomy_percent).
     pub autonomy_percent: f64,
     /// Times the car was put back in assisted runs.
     pub interventions: usize,
     /// The same for each km.
     pub interventions_per_km: f64,
-    /// Way of the free runs, m.
+    /// Distance driven in the free trials, m.
     pub distance_m: f64,
     /// Distance from the line in free runs: mean, m.
     pub cte_mean_m: f64,
@@ -87,7 +87,7 @@ pub struct DriveSummary {
     pub crashes: usize,
     /// Mean speed of the free runs, mph.
     pub mean_speed_mph: f64,
-    /// Root mean square rate of the steering, deg/s, over the free runs: what the wheel trembles.
+    /// Whiteness: root mean square rate of the steering, deg/s, over the free trials.
     pub whiteness_deg_s: f64,
     /// The same for the expert with the same seeds.
     pub expert_whiteness_deg_s: f64,
@@ -96,11 +96,11 @@ pub struct DriveSummary {
     pub realtime_factor: f64,
 }
 
-/// A drive: every run and their summary.
+/// A drive: all trials and their summary.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DriveResult {
     /// Trials in the order of their seeds.
     pub trials: Vec<TrialPair>,
-    /// Measures over all runs.
+    /// Measures over all trials.
     pub summary: DriveSummary,
 }
