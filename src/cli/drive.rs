@@ -7,9 +7,10 @@ use serde::Serialize;
 
 use super::share_bar::ShareBar;
 use super::video::tell_video;
-use super::{pool, print, print_json, stop_on_ctrl_c};
+use super::{load_pilot, pool, print, print_json, stop_on_ctrl_c};
 use crate::dataset::held_out::trained_on_held_out;
 use crate::error::{Error, Result};
+use crate::files::limits::keep_elsewhere;
 use crate::files::new_folder::NewFolder;
 use crate::live::messages::Hello;
 use crate::live::{DEFAULT_PORT, Live, Watch};
@@ -133,9 +134,15 @@ pub fn run(args: DriveArgs) -> Result<()> {
     }
     let comparison = other.as_ref().map_or(Ok(Vec::new()), |other| compare(&result, other))?;
     // What was measured is told even if it cannot be saved.
-    let saved = folder.map_or(Ok(()), |folder| {
+    let save = |folder: NewFolder| {
         map::write(&track, &result, &folder)?;
         write_trajectories(&result, folder)
+    };
+    let saved = folder.map_or(Ok(()), |folder| {
+        save(folder).map_err(|cause| {
+            let again = |other: &Path| save(NewFolder::create(&other.join("drive"))?);
+            keep_elsewhere(cause, again, |other| format!("the drive is kept in {}", other.join("drive").display()))
+        })
     });
     let film = |video: DriveVideo| at_wheel.film(video, &track, &options, &args, &stop);
     if args.json {
@@ -180,7 +187,7 @@ impl Wheel {
         Ok(match name {
             "expert" => Wheel::Expert,
             "zero" => Wheel::Zero,
-            path => Wheel::Model(Box::new(Pilot::load(Path::new(path))?)),
+            path => Wheel::Model(Box::new(load_pilot(Path::new(path))?)),
         })
     }
 

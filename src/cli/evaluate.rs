@@ -8,12 +8,11 @@ use rayon::prelude::*;
 use serde::Serialize;
 use steersman_kernels::Isa;
 
-use super::{or_dash, pool, print_json};
+use super::{load_model, or_dash, pool, print_json};
 use crate::dataset::held_out::trained_on_held_out;
 use crate::dataset::{self, Recording, View};
 use crate::error::{Error, Result};
 use crate::metrics::{Metrics, Prediction};
-use crate::model_file::Model;
 use crate::pilot::Pilot;
 
 /// Compare a model's steering with what was recorded: centre camera, every usable row
@@ -42,7 +41,7 @@ struct Report<'a> {
 }
 
 pub fn run(args: EvaluateArgs) -> Result<()> {
-    let model = Model::load(&args.model)?;
+    let model = load_model(&args.model)?;
     let trained_on: BTreeSet<u64> = model.training_rows.iter().copied().collect();
     let held_out = model.record.trained_on_held_out.clone();
     let full_lock_deg = model.recipe.full_lock_deg;

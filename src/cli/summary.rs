@@ -6,7 +6,7 @@ use clap::Args;
 use serde::Serialize;
 use steersman_kernels::Isa;
 
-use super::{RecipeArgs, print, print_json, refuse_existing};
+use super::{RecipeArgs, load_model, print, print_json, refuse_existing};
 use crate::engine::network::{NamedLayer, Network};
 use crate::error::Result;
 use crate::files::atomic_file;
@@ -75,7 +75,7 @@ pub fn run(args: SummaryArgs) -> Result<()> {
     let mut heading = String::new();
     let recipe = match &args.model {
         Some(path) => {
-            let model = Model::load(path)?;
+            let model = load_model(path)?;
             heading = format!("{}: recipe {}, {}\n", path.display(), model.recipe.name, training_line(&model));
             model.recipe
         }

@@ -6,9 +6,8 @@ use clap::Args;
 use serde::Serialize;
 
 use super::share_bar::ShareBar;
-use super::{print_json, stop_on_ctrl_c};
+use super::{load_pilot, print_json, stop_on_ctrl_c};
 use crate::error::{Error, Result};
-use crate::pilot::Pilot;
 use crate::report::video::onlooker::Onlooker;
 use crate::report::video::recording;
 use crate::report::video::replay::{self, RunChoice};
@@ -52,7 +51,7 @@ struct Answer<'a> {
 
 pub fn run(args: VideoArgs) -> Result<()> {
     let onlooker = match &args.model {
-        Some(model) => Some(Onlooker::new(Pilot::load(model)?, args.saliency)?),
+        Some(model) => Some(Onlooker::new(load_pilot(model)?, args.saliency)?),
         None => None,
     };
     let is_drive = is_drive(&args.source);

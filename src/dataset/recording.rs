@@ -3,8 +3,9 @@
 use super::pictures::files::{Files, Name};
 use super::pictures::preprocess::Preprocessing;
 use super::unusable::{Reason, Unusable};
+use crate::files::limits::read_up_to;
 use crate::picture::RgbImage;
-use crate::picture::decode::decode_rgb;
+use crate::picture::decode::{MAX_FILE_LEN, decode_rgb};
 use crate::{Error, Result};
 use serde::Serialize;
 use sha2::{Digest, Sha256};
@@ -117,7 +118,7 @@ impl Recording {
 
     /// The picture of `camera` at `row`, if there is one that can be read and decoded.
     pub fn picture(&self, row: usize, camera: View) -> Option<RgbImage> {
-        let bytes = std::fs::read(self.image_path(row, camera)?).ok()?;
+        let bytes = read_up_to(&self.image_path(row, camera)?, MAX_FILE_LEN, "a picture").ok()?;
         let mut image = RgbImage::default();
         decode_rgb(&bytes, &mut image).ok()?;
         Some(image)

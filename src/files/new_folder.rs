@@ -88,8 +88,7 @@ impl NewFolder {
 pub(crate) fn explain_full_disk(path: &Path, out: &Path, source: io::Error, kind: &str) -> Error {
     let full = [ErrorKind::StorageFull, ErrorKind::QuotaExceeded, ErrorKind::FileTooLarge];
     if full.contains(&source.kind()) {
-        let remedy =
-            format!("nothing of {} is kept; make room on that disk, or name a {kind} on another", out.display());
+        let remedy = format!("{} was not created; make room on that disk, or name a {kind} on another", out.display());
         return Error::CannotWrite { path: path.into(), source, remedy };
     }
     Error::io(path)(source)

@@ -16,6 +16,9 @@ pub const MAX_SIDE: usize = 8192;
 /// Most pixels of an image that is decoded: 16 megapixels.
 pub const MAX_PIXELS: usize = 16 << 20;
 
+/// Longest file of a picture that is read, bytes.
+pub const MAX_FILE_LEN: u64 = 64 << 20;
+
 /// Most memory that decoding a PNG may take, bytes.
 const MAX_DECODED_LEN: u64 = 64 << 20;
 
@@ -56,6 +59,14 @@ pub fn decode_rgb_within(bytes: &[u8], max_side: usize, image: &mut RgbImage) ->
 /// # Errors
 /// As [`decode_rgb`].
 pub fn image_size(bytes: &[u8]) -> Result<[usize; 2], String> {
+    if bytes.starts_with(PNG_SIGNATURE) {
+        // Other readers would unpack the profiles and texts that stand before the pixels.
+        let number = |at: usize| Some(u32::from_be_bytes(*bytes.get(at..)?.first_chunk()?) as usize);
+        return match (bytes.get(12..16), number(20), number(16)) {
+            (Some(b"IHDR"), Some(height), Some(width)) => Ok([height, width]),
+            _ => Err("the PNG has no header".into()),
+        };
+    }
     let reader = image::ImageReader::new(Cursor::new(bytes)).with_guessed_format().map_err(|e| e.to_string())?;
     let (width, height) = reader.into_dimensions().map_err(|e| e.to_string())?;
     Ok([height as usize, width as usize])
@@ -183,6 +194,43 @@ mod tests {
         encoder.write_image(&gradient(24, 40), 24, 40, image::ExtendedColorType::Rgb8).unwrap();
         assert!(decode_rgb_within(&png, 40, &mut image).is_ok());
         assert!(decode_rgb_within(&png, 39, &mut image).is_err());
+    }
+
+    #[test]
+    fn a_png_whose_profile_unpacks_to_hundreds_of_megabytes_costs_no_more_than_its_pixels() {
+        let mut png = Vec::new();
+        let encoder = image::codecs::png::PngEncoder::new(&mut png);
+        encoder.write_image(&gradient(24, 40), 24, 40, image::ExtendedColorType::Rgb8).unwrap();
+        let mut plain = RgbImage::default();
+        decode_rgb(&png, &mut plain).unwrap();
+
+        let mut packed = flate2::write::ZlibEncoder::new(b"bomb\0\0".to_vec(), flate2::Compression::best());
+        let zeros = vec![0; 1 << 20];
+        (0..512).for_each(|_| std::io::Write::write_all(&mut packed, &zeros).unwrap());
+        let packed = packed.finish().unwrap();
+        let mut crc = flate2::Crc::new();
+        crc.update(b"iCCP");
+        crc.update(&packed);
+        // Behind the signature and IHDR.
+        let chunk = [&(packed.len() as u32).to_be_bytes(), &b"iCCP"[..], &packed, &crc.sum().to_be_bytes()].concat();
+        let bomb = [&png[..33], &chunk, &png[33..]].concat();
+        assert!(bomb.len() < 1 << 20);
+        let kept = without_metadata(&bomb);
+        assert_eq!(&*kept, &png[..], "nothing unpacks the profile");
+        let mut image = RgbImage::default();
+        decode_rgb(&bomb, &mut image).unwrap();
+        assert!(image == plain && image_size(&bomb) == Ok([40, 24]));
+    }
+
+    #[test]
+    fn more_than_16_megapixels_are_refused_before_they_take_memory() {
+        let mut header = PNG_SIGNATURE.to_vec();
+        header.extend(13u32.to_be_bytes());
+        header.extend(b"IHDR");
+        header.extend([8192u32.to_be_bytes(), 2049u32.to_be_bytes()].concat());
+        header.extend([8, 2, 0, 0, 0, 0, 0, 0, 0]);
+        let error = decode_rgb(&header, &mut RgbImage::default()).unwrap_err();
+        assert!(error.contains("8192x2049 pixels; at most 16 megapixels"), "{error}");
     }
 
     #[test]
