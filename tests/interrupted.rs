@@ -150,7 +150,7 @@ fn files_that_must_not_grow_are_errors_with_a_remedy() {
         assert!(said.contains("make room on that disk"), "{args}: {said}");
     };
     limited(64, "train log --recipe lenet --set epochs=1 --set batch=16 --out full");
-    limited(8, "export run/model.safetensors --out model.onnx");
+    limited(8, "export run/model.safetensors model.onnx --to onnx");
     limited(0, "drive run/model.safetensors --track lake --laps 1 --runs 1 --out drive");
     assert!(!folder.path().join("drive").exists() && !folder.path().join("model.onnx").exists());
     let hidden = |folder: &Path| {
@@ -222,7 +222,7 @@ fn a_read_only_folder_is_an_error_with_a_remedy() {
     let folder = finished_run();
     for args in [
         &[&QUICK[..], &["--out", "OUT"]].concat()[..],
-        &["export", "run/model.safetensors", "--out", "OUT.onnx"],
+        &["export", "run/model.safetensors", "OUT.onnx", "--to", "onnx"],
         &["drive", "zero", "--track", "lake", "--runs", "1", "--out", "OUT"],
         &["record", "--track", "lake", "--laps", "0.1", "--out", "OUT"],
         &["serve", "run/model.safetensors", "--port", "0", "--record", "OUT"],

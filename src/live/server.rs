@@ -98,7 +98,7 @@ impl Live {
     }
 
     /// Calls `look` with the wheel, if a person may drive.
-    pub fn with_wheel<T>(&self, look: impl FnOnce(&mut Wheel) -> T) -> Option<T> {
+    pub(crate) fn with_wheel<T>(&self, look: impl FnOnce(&mut Wheel) -> T) -> Option<T> {
         self.hub.wheel().map(|mut wheel| look(&mut wheel))
     }
 
