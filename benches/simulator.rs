@@ -9,8 +9,8 @@ use steersman::recipe::Recipe;
 use steersman::simulator::jpeg;
 use steersman::simulator::run_trial;
 use steersman::simulator::{
-    Camera, DriveState, Driver, Expert, HEIGHT, Mount, Renderer, RgbFrame, Simulation, Speed, Start, Track,
-    TrialOptions, Variant, WIDTH,
+    Camera, DriveState, Driver, Expert, Mount, Renderer, RgbFrame, Simulation, Speed, Start, Track, TrialOptions,
+    Variant,
 };
 use steersman_kernels::Isa;
 
@@ -61,7 +61,7 @@ struct Watching(Option<Pilot>);
 impl Driver for Watching {
     fn steer(&mut self, frame: &RgbFrame, state: &DriveState) -> f32 {
         if let Some(pilot) = &mut self.0 {
-            black_box(pilot.steer(HEIGHT, WIDTH, &frame.pixels)).expect("a picture of the right size");
+            black_box(pilot.steer(frame.view())).expect("a picture of the right size");
         }
         black_box(frame);
         Expert.steer(frame, state)

@@ -1,6 +1,7 @@
 //! A whole training step of each shipped network on random images: forward, backward, update. All cores.
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
+use ndarray::{ArrayView1, ArrayView4};
 use steersman::engine::network::{StepInput, TrainingPlan};
 use steersman::engine::optimizer::Optimizer;
 use steersman::engine::random::{Purpose, rng, uniform};
@@ -21,10 +22,11 @@ fn training_step(c: &mut Criterion) {
         let (x, labels) = (fill(BATCH * network.input().len()), fill(BATCH));
         let mut parameters = network.initialize(1);
         let mut plan = TrainingPlan::new(&network, BATCH);
-        let mut optimizer = Optimizer::new(recipe.optimizer, None, &network);
+        let mut optimizer = Optimizer::new(recipe.optimizer, None, network.tensors(), network.isa());
         group.bench_function(name, |b| {
             b.iter(|| {
-                let input = StepInput { x: &x, labels: &labels, seed: 1, step: optimizer.updates };
+                let x = ArrayView4::from_shape(network.input().batch(BATCH), &x).expect("a batch");
+                let input = StepInput { x, labels: ArrayView1::from(&labels), seed: 1, step: optimizer.updates };
                 let loss = plan.step(&network, &mut parameters, &recipe.loss, input);
                 let norm = plan.gradient_norm();
                 optimizer.step(1e-4, &mut parameters.values, plan.gradient_mut(), norm);

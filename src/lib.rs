@@ -25,12 +25,12 @@
 //!
 //! ```no_run
 //! use std::path::Path;
+//! use ndarray::Array3;
 //! use steersman::pilot::Pilot;
 //!
 //! let mut pilot = Pilot::load(Path::new("runs/lenet-1/model.safetensors"))?;
-//! let (height, width) = (160, 320);
-//! let rgb = vec![128; height * width * 3]; // a frame, row by row; `steer_encoded` and `steer_file` take JPEG and PNG
-//! let steering = pilot.steer(height, width, &rgb)?; // roughly in [-1, 1], positive to the right
+//! let image = Array3::<u8>::zeros((160, 320, 3)); // height, width, RGB; `steer_encoded` and `steer_file` take JPEG and PNG
+//! let steering = pilot.steer(image.view())?; // roughly in [-1, 1], positive to the right
 //! println!("{:+.1} degrees", pilot.recipe().full_lock_deg * f64::from(steering));
 //! # Ok::<(), steersman::Error>(())
 //! ```
@@ -74,6 +74,7 @@
 //! # Train on numbers of your own
 //!
 //! ```
+//! use ndarray::{arr1, arr2};
 //! use steersman::engine::layers::DenseSpec;
 //! use steersman::engine::network::{Network, StepInput, TrainingPlan};
 //! use steersman::engine::optimizer::{Optimizer, OptimizerSpec};
@@ -84,14 +85,15 @@
 //! // y = x1 − x2, learned by one dense layer.
 //! let layers = [DenseSpec { units: 1, init: Initializer::GlorotUniform }.into()];
 //! let network = Network::new(Shape::vector(2), &layers, Isa::best())?;
-//! let (x, labels) = ([1.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.5, 1.0], [1.0, -1.0, 0.0, -0.5]);
+//! let (x, labels) = (arr2(&[[1.0, 0.0], [0.0, 1.0], [1.0, 1.0], [0.5, 1.0]]), arr1(&[1.0, -1.0, 0.0, -0.5]));
+//! let x = x.into_shape_with_order((4, 2, 1, 1)).unwrap(); // a vector of 2 is an image of 2 channels, 1 row, 1 column
 //!
 //! let spec = OptimizerSpec::Sgd { learning_rate: 0.3, momentum: 0.0, l2: 0.0, decoupled_weight_decay: 0.0 };
 //! let mut parameters = network.initialize(1);
 //! let mut plan = TrainingPlan::new(&network, labels.len());
-//! let mut optimizer = Optimizer::new(spec, None, &network);
+//! let mut optimizer = Optimizer::new(spec, None, network.tensors(), network.isa());
 //! for step in 0..200 {
-//!     let input = StepInput { x: &x, labels: &labels, seed: 1, step };
+//!     let input = StepInput { x: x.view(), labels: labels.view(), seed: 1, step };
 //!     plan.step(&network, &mut parameters, &Loss::default(), input);
 //!     let norm = plan.gradient_norm();
 //!     optimizer.step(0.3, &mut parameters.values, plan.gradient_mut(), norm);
@@ -149,28 +151,52 @@
 //! ```
 #![forbid(unsafe_code)]
 
+#[cfg(feature = "cli")]
 pub mod cli;
+#[cfg(feature = "training")]
 pub mod dataset;
 pub mod engine;
 pub mod error;
+#[cfg(feature = "exchange")]
 pub mod exchange;
+#[cfg(feature = "training")]
 pub mod files;
+#[cfg(feature = "live")]
 pub mod live;
+#[cfg(feature = "cli")]
 pub mod main_job;
+#[cfg(feature = "training")]
 pub mod metrics;
+#[cfg(feature = "training")]
 pub mod model_file;
+#[cfg(any(feature = "live", feature = "serve"))]
+#[cfg_attr(not(feature = "serve"), allow(dead_code, reason = "the live page alone needs a part of it"))]
 mod net;
+#[cfg(feature = "training")]
 pub mod observer;
+#[cfg(feature = "training")]
 pub mod picture;
+#[cfg(feature = "training")]
 pub mod pilot;
+#[cfg(feature = "training")]
 pub mod recipe;
+#[cfg(feature = "report")]
 pub mod report;
+#[cfg(feature = "serve")]
 pub mod serve;
+#[cfg(feature = "simulator")]
 pub mod simulator;
+#[cfg(feature = "serve")]
 pub mod simulator_client;
+#[cfg(feature = "simulator")]
 mod statistics;
+mod suggestion;
+#[cfg(feature = "training")]
+#[cfg_attr(not(feature = "cli"), allow(dead_code, reason = "the smaller feature sets show less foreign text"))]
 mod text;
+#[cfg(feature = "training")]
 pub mod training;
+#[cfg(feature = "serve")]
 pub mod udacity;
 
 pub use error::{Error, Result};

@@ -22,24 +22,24 @@ use crate::recipe::Recipe;
 const FORMAT: u32 = 1;
 const METADATA_KEY: &str = "steersman";
 const TRAINING_ROWS: &str = "training_rows";
-/// What the number means that a model gives.
+/// The meaning of the output of a model.
 pub(crate) const LABEL: &str =
     "steering in [-1, 1], positive to the right; times recipe.full_lock_deg it is degrees of the front wheels";
 
-/// A network with its numbers and its story.
+/// A trained network: recipe, parameters, and the record of its training.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Model {
-    /// How it was made, and what it takes to use it: network, preprocessing, full-lock angle.
+    /// The recipe: network, preprocessing, full-lock angle, and how it was trained.
     pub recipe: Recipe,
     /// The numbers.
     pub parameters: Parameters,
-    /// How training went.
+    /// The record of a training run.
     pub record: TrainingRecord,
     /// [`row_id`](crate::dataset::Recording::row_id)s of the rows it was trained on, sorted.
     pub training_rows: Vec<u64>,
 }
 
-/// How training went.
+/// The record of a training run.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TrainingRecord {
@@ -69,7 +69,7 @@ pub struct TrainingRecord {
     pub trained_on_held_out: Vec<String>,
 }
 
-/// What a training run took over from a model.
+/// What a training run took from a model.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Transfer {

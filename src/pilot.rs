@@ -3,10 +3,12 @@
 use std::path::Path;
 use std::sync::Arc;
 
+use ndarray::{Array1, ArrayView3, ArrayView4, ArrayViewD, ArrayViewMut1, Axis};
+use rayon::prelude::*;
 use steersman_kernels::Isa;
 
 use crate::dataset::preprocess::Preprocessor;
-use crate::engine::network::{InferencePlan, Network, ObservationPlan, Parameters};
+use crate::engine::network::{Network, ObservationPlan, Parameters, Predictor};
 use crate::error::{Error, Result};
 use crate::files::limits::read_up_to;
 use crate::model_file::Model;
@@ -15,12 +17,11 @@ use crate::picture::{
     decode::{MAX_FILE_LEN, MAX_SIDE, decode_rgb_within},
 };
 use crate::recipe::Recipe;
-use crate::simulator::{DriveState, Driver, HEIGHT, RgbFrame, WIDTH};
 
-/// A model with everything planned to predict one image after the other on the calling thread.
+/// A model that predicts the steering of one image after the other on the calling thread.
 ///
-/// The same code evaluates recordings, answers `predict` and drives, so all of them see an image alike. After the first image
-/// of a size nothing is allocated. Clones share the network; give each thread its own.
+/// The same code evaluates recordings, answers `predict` and drives, so all of them see an image alike. Clones share the network;
+/// give each thread its own.
 ///
 /// ```no_run
 /// use std::path::Path;
@@ -34,22 +35,25 @@ use crate::simulator::{DriveState, Driver, HEIGHT, RgbFrame, WIDTH};
 /// ```
 #[derive(Clone, Debug)]
 pub struct Pilot {
-    model: Arc<Loaded>,
-    plan: InferencePlan,
-    /// Planned when somebody first wants to see what the layers make of an image.
+    about: Arc<About>,
+    predictor: Predictor,
+    /// Planned on the first call that observes the layers.
     observation: Option<ObservationPlan>,
     preprocessor: Preprocessor,
+    /// A decoded image file.
     image: RgbImage,
+    /// An image of the caller that is not contiguous, in standard order.
+    pixels: Vec<u8>,
+    /// The preprocessed image, before scaling.
     planes: Vec<u8>,
+    /// Input of the network.
     input: Vec<f32>,
 }
 
-/// What the clones of a pilot share.
+/// What the clones of a pilot share beside the network.
 #[derive(Debug)]
-struct Loaded {
+struct About {
     recipe: Recipe,
-    network: Network,
-    parameters: Parameters,
     trained_on_held_out: Vec<String>,
 }
 
@@ -73,81 +77,108 @@ impl Pilot {
         let trained_on_held_out = record.trained_on_held_out;
         let network = recipe.network(isa)?;
         let [height, width] = recipe.preprocessing.source;
-        let mut plan = InferencePlan::new(&network, 1);
-        plan.prepare(&network, &parameters);
         Ok(Pilot {
-            plan,
+            predictor: Predictor::new(network, parameters, 1),
             observation: None,
             preprocessor: recipe.preprocessing.plan(height, width)?,
             image: RgbImage::default(),
             planes: vec![0; recipe.preprocessing.output_len()],
             input: vec![0.0; recipe.preprocessing.output_len()],
-            model: Arc::new(Loaded { recipe, network, parameters, trained_on_held_out }),
+            pixels: Vec::new(),
+            about: Arc::new(About { recipe, trained_on_held_out }),
         })
     }
 
-    /// How the model was made.
+    /// The recipe of the model.
     pub fn recipe(&self) -> &Recipe {
-        &self.model.recipe
+        &self.about.recipe
     }
 
-    /// Held-out tracks that the model was trained on all the same.
+    /// Held-out tracks that the model was trained on nevertheless.
     pub fn trained_on_held_out(&self) -> &[String] {
-        &self.model.trained_on_held_out
+        &self.about.trained_on_held_out
     }
 
     /// The network that steers.
     pub fn network(&self) -> &Network {
-        &self.model.network
+        self.predictor.network()
     }
 
-    /// The numbers of the network.
+    /// The parameters of the network.
     pub fn parameters(&self) -> &Parameters {
-        &self.model.parameters
+        self.predictor.parameters()
     }
 
-    /// Steering for an RGB image, `[height][width][3]`. Roughly in [−1, 1], positive to the right; not clamped.
+    /// The tensor `name` of the network, as in `conv1.weight`: an array of its shape, `(out, in, kh, kw)` for a convolution.
+    /// [`Network::tensors`] lists the names.
+    pub fn weights(&self, name: &str) -> Option<ArrayViewD<'_, f32>> {
+        Some(self.parameters().array(self.network().tensor(name)?))
+    }
+
+    /// Steering for an RGB image, `(height, width, 3)`: roughly in [−1, 1], positive to the right; not clamped.
+    ///
+    /// An image that is contiguous in standard order is read where it lies, any other is copied first. After the first image of a
+    /// size nothing is allocated.
     ///
     /// # Errors
     ///
-    /// [`Error::Input`] if the image has no pixels, or not as many as it says.
-    pub fn steer(&mut self, height: usize, width: usize, rgb: &[u8]) -> Result<f32> {
-        self.look_at(height, width, rgb)?;
+    /// [`Error::Input`] if the image has no pixels, or not three colours.
+    pub fn steer(&mut self, image: ArrayView3<u8>) -> Result<f32> {
+        self.preprocess(image)?;
         let mut steering = [0.0];
-        self.plan.run_prepared(&self.model.network, &self.model.parameters, &self.input, &mut steering);
+        let input = ArrayView4::from_shape(self.predictor.network().input().batch(1), &self.input);
+        let input = input.expect("preprocessing gives an image of the network's input shape");
+        self.predictor.run(input, ArrayViewMut1::from(&mut steering));
         Ok(steering[0])
     }
 
-    /// As [`steer`](Self::steer), telling `seen` the place of each layer that computes something, and its output.
+    /// Steering for each of `images`, `(n, height, width, 3)`; the images are shared out over the rayon pool. The bits are those of
+    /// [`steer`](Self::steer).
     ///
     /// # Errors
     ///
     /// As [`steer`](Self::steer).
-    pub fn steer_observed(
-        &mut self,
-        height: usize,
-        width: usize,
-        rgb: &[u8],
-        seen: &mut dyn FnMut(usize, &[f32]),
-    ) -> Result<f32> {
-        self.look_at(height, width, rgb)?;
-        let Loaded { network, parameters, .. } = &*self.model;
+    pub fn predict(&self, images: ArrayView4<u8>) -> Result<Array1<f32>> {
+        let steer = |pilot: &mut Pilot, index: usize| pilot.steer(images.index_axis(Axis(0), index));
+        let steering = (0..images.len_of(Axis(0))).into_par_iter().map_init(|| self.clone(), steer);
+        Ok(Array1::from(steering.collect::<Result<Vec<f32>>>()?))
+    }
+
+    /// [`steer`](Self::steer) that calls `seen` with the index in [`Network::layers`] and the output, `[c][h][w]`, of each layer that
+    /// computes something.
+    ///
+    /// # Errors
+    ///
+    /// As [`steer`](Self::steer).
+    pub fn steer_observed(&mut self, image: ArrayView3<u8>, seen: &mut dyn FnMut(usize, &[f32])) -> Result<f32> {
+        self.preprocess(image)?;
+        let (network, parameters) = (self.predictor.network(), self.predictor.parameters());
         let mut steering = [0.0];
         let plan = self.observation.get_or_insert_with(|| ObservationPlan::new(network));
         plan.run(network, parameters, &self.input, &mut steering, seen);
         Ok(steering[0])
     }
 
-    /// Makes the network's input of an RGB image.
-    fn look_at(&mut self, height: usize, width: usize, rgb: &[u8]) -> Result<()> {
-        if rgb.len() != height * width * 3 {
-            return Err(Error::Input(format!("{} bytes are no RGB image of {width}x{height} pixels", rgb.len())));
+    /// Writes the network's input for an RGB image.
+    fn preprocess(&mut self, image: ArrayView3<u8>) -> Result<()> {
+        let (height, width, colours) = image.dim();
+        if colours != 3 || image.is_empty() {
+            let found = format!("({height}, {width}, {colours})");
+            return Err(Error::Input(format!("an RGB image has the shape (height, width, 3), not {found}")));
         }
         if self.preprocessor.image_size() != [height, width] {
-            self.preprocessor = self.model.recipe.preprocessing.plan(height, width)?;
+            self.preprocessor = self.about.recipe.preprocessing.plan(height, width)?;
         }
+        let rgb = match image.to_slice() {
+            Some(rgb) => rgb,
+            None => {
+                self.pixels.clear();
+                self.pixels.extend(image);
+                &self.pixels
+            }
+        };
         self.preprocessor.apply(rgb, &mut self.planes);
-        self.model.recipe.preprocessing.to_input(&self.planes, &mut self.input);
+        self.about.recipe.preprocessing.to_input(&self.planes, &mut self.input);
         Ok(())
     }
 
@@ -168,7 +199,7 @@ impl Pilot {
     pub fn steer_encoded_within(&mut self, bytes: &[u8], max_side: usize) -> Result<f32> {
         let mut image = std::mem::take(&mut self.image);
         let steering = match decode_rgb_within(bytes, max_side, &mut image) {
-            Ok(()) => self.steer(image.height, image.width, &image.pixels),
+            Ok(()) => self.steer(image.view()),
             Err(message) => Err(Error::Codec(message)),
         };
         self.image = image;
@@ -189,15 +220,10 @@ impl Pilot {
     }
 }
 
-impl Driver for Pilot {
-    fn steer(&mut self, frame: &RgbFrame, _: &DriveState) -> f32 {
-        // A frame always has the size it says, so this cannot fail; the simulator takes what is no number as straight ahead.
-        Pilot::steer(self, HEIGHT, WIDTH, &frame.pixels).unwrap_or(f32::NAN)
-    }
-}
-
 #[cfg(test)]
 mod tests {
+    use ndarray::{Array3, Array4};
+
     use super::*;
     use crate::model_file::TrainingRecord;
 
@@ -210,33 +236,44 @@ mod tests {
 
     #[test]
     fn every_recipe_steers_an_image_of_any_size() {
-        let mut pixel = 0u8;
-        let mut picture = |len: usize| -> Vec<u8> {
-            (0..len)
-                .map(|_| {
-                    pixel = pixel.wrapping_mul(41).wrapping_add(17);
-                    pixel
-                })
-                .collect()
-        };
-        let (usual, small) = (picture(160 * 320 * 3), picture(120 * 160 * 3));
+        let picture = |h, w| Array3::from_shape_fn((h, w, 3), |(y, x, c)| ((y * 41 + x * 17 + c * 7) % 251) as u8);
+        let (usual, small) = (picture(160, 320), picture(120, 160));
         for (name, _) in crate::recipe::SHIPPED {
             let mut pilot = pilot(name);
-            let first = pilot.steer(160, 320, &usual).unwrap();
-            assert!(pilot.steer(120, 160, &small).unwrap().is_finite());
-            assert_eq!(
-                pilot.steer(160, 320, &usual).unwrap(),
-                first,
-                "{name}: an image must not depend on earlier ones"
-            );
+            let first = pilot.steer(usual.view()).unwrap();
+            assert!(pilot.steer(small.view()).unwrap().is_finite());
+            assert_eq!(pilot.steer(usual.view()).unwrap(), first, "{name}: an image must not depend on earlier ones");
         }
+    }
+
+    #[test]
+    fn a_batch_and_a_view_in_another_memory_order_are_steered_alike() {
+        let mut pilot = pilot("lenet");
+        let images =
+            Array4::from_shape_fn((3, 160, 320, 3), |(n, y, x, c)| ((n * 91 + y * 41 + x * 17 + c * 7) % 251) as u8);
+        let one_by_one: Vec<f32> = images.outer_iter().map(|image| pilot.steer(image).unwrap()).collect();
+        assert_eq!(pilot.predict(images.view()).unwrap().to_vec(), one_by_one);
+        assert!(one_by_one[0] != one_by_one[1]);
+        let planes = images.index_axis(Axis(0), 0).permuted_axes([2, 0, 1]).as_standard_layout().into_owned();
+        let same_image = planes.view().permuted_axes([1, 2, 0]);
+        assert!(same_image.to_slice().is_none());
+        assert_eq!(pilot.steer(same_image).unwrap(), one_by_one[0]);
+    }
+
+    #[test]
+    fn weights_have_the_names_and_shapes_of_the_network() {
+        let pilot = pilot("lenet");
+        let weight = pilot.weights("conv1.weight").unwrap();
+        assert_eq!(weight.shape(), &pilot.network().tensor("conv1.weight").unwrap().spec.shape[..]);
+        assert_eq!(weight.iter().next(), pilot.parameters().values.first());
+        assert!(pilot.weights("conv9.weight").is_none());
     }
 
     #[test]
     fn what_is_no_image_is_an_error() {
         let mut pilot = pilot("lenet");
-        assert!(pilot.steer(160, 320, &[0; 7]).is_err());
-        assert!(pilot.steer(0, 0, &[]).is_err());
+        assert!(pilot.steer(Array3::zeros((160, 320, 4)).view()).is_err());
+        assert!(pilot.steer(Array3::zeros((0, 320, 3)).view()).is_err());
         assert_eq!(pilot.steer_encoded(b"GIF89a").unwrap_err().to_string(), "neither a JPEG nor a PNG image");
     }
 }

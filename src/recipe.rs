@@ -5,7 +5,7 @@
 //!
 //! # To add a recipe
 //!
-//! Put a TOML file into `data/recipes/` and a line into [`SHIPPED`]; a test builds every shipped recipe.
+//! Put a TOML file into `data/recipes/`: [`SHIPPED`] lists what lies there, and a test builds every recipe of it.
 
 use std::path::Path;
 
@@ -21,17 +21,12 @@ use crate::engine::network::{LayerSpec, Network};
 use crate::engine::optimizer::{OptimizerSpec, Schedule, ScheduleSpec};
 use crate::engine::tensor::Shape;
 use crate::error::{Error, Result};
+use crate::suggestion::did_you_mean;
 
-/// Name and text of each recipe that is built in.
-pub const SHIPPED: [(&str, &str); 5] = [
-    ("default", include_str!("../data/recipes/default.toml")),
-    ("hyper", include_str!("../data/recipes/hyper.toml")),
-    ("hyper-prelu", include_str!("../data/recipes/hyper-prelu.toml")),
-    ("lenet", include_str!("../data/recipes/lenet.toml")),
-    ("pilotnet", include_str!("../data/recipes/pilotnet.toml")),
-];
+/// Name and text of each recipe that is built in, by name.
+pub const SHIPPED: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/recipes.rs"));
 
-/// Longer networks are refused.
+/// Maximum of layers of a network.
 const MAX_LAYERS: usize = 1000;
 
 /// A whole experiment.
@@ -50,7 +45,7 @@ pub struct Recipe {
     /// Angle of the front wheels at steering 1, in degrees; turns errors into degrees.
     #[serde(default = "default_full_lock_deg")]
     pub full_lock_deg: f64,
-    /// What training makes small.
+    /// The function that training minimizes.
     #[serde(default)]
     pub loss: Loss,
     /// Gradients with a larger L2 norm are scaled down to this one.
@@ -78,14 +73,14 @@ pub struct Recipe {
     /// Training side and validation side.
     #[serde(default)]
     pub split: SplitSpec,
-    /// How parameters follow the gradient.
+    /// The algorithm that updates the parameters.
     pub optimizer: OptimizerSpec,
-    /// How the learning rate changes.
+    /// The learning-rate schedule.
     #[serde(default)]
     pub schedule: ScheduleSpec,
 }
 
-/// Ends a run when the validation loss has stopped to fall; the best weights are kept.
+/// Ends a run when the validation loss stops falling; the best weights become the model.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct EarlyStopping {
@@ -127,7 +122,7 @@ impl Recipe {
                 std::fs::read_to_string(name).map_err(Error::io(name))?
             }
             None => {
-                let names = SHIPPED.map(|(name, _)| name);
+                let names: Vec<&str> = SHIPPED.iter().map(|(name, _)| *name).collect();
                 return Err(Error::Usage(format!(
                     "there is no recipe `{name}`{}; built in are {}; a recipe of your own is given as FILE.toml",
                     did_you_mean(name, &names),
@@ -259,16 +254,6 @@ fn set(table: &mut toml::Table, entry: &str) -> Result<(), String> {
     Ok(())
 }
 
-/// ` (did you mean …?)` with the nearest of `known`, or nothing if none is near.
-pub fn did_you_mean(name: &str, known: &[&str]) -> String {
-    known
-        .iter()
-        .map(|candidate| (strsim::damerau_levenshtein(name, candidate), candidate))
-        .min()
-        .filter(|(distance, candidate)| *distance <= 1 + name.len().max(candidate.len()) / 3)
-        .map_or(String::new(), |(_, candidate)| format!(" (did you mean `{candidate}`?)"))
-}
-
 /// Adds the nearest known name to serde's «unknown field `x`, expected one of `a`, `b`».
 fn with_nearest(message: &str) -> String {
     let message = message.trim_end();
@@ -313,7 +298,7 @@ mod tests {
     fn shipped_recipes_are_called_like_their_files_and_survive_being_written() {
         for (name, _) in SHIPPED {
             let recipe = Recipe::find(name, &[]).unwrap();
-            assert_eq!(recipe.name, name);
+            assert_eq!(recipe.name, *name);
             assert_eq!(Recipe::parse(name, &recipe.to_toml().unwrap(), &[]).unwrap(), recipe);
         }
     }

@@ -42,9 +42,17 @@ const LAYERS: &str = r#"[
   { kind = "softsign" },
   { kind = "dense", units = 8 },
   { kind = "relu" },
+  { kind = "swish" },
   { kind = "flatten" },
   { kind = "dense", units = 1 },
 ]"#;
+
+#[test]
+fn every_kind_of_layer_is_exported_here() {
+    for (kind, _) in steersman::engine::network::LayerSpec::EXAMPLES {
+        assert!(LAYERS.contains(&format!("kind = \"{kind}\"")), "{kind}");
+    }
+}
 
 /// Every colour space, resized in every way: halved, linear down and up, area down and up, not at all.
 const PREPROCESSINGS: [(&str, &str); 10] = [
@@ -133,7 +141,10 @@ fn compare(model: &Model, language: &str, file: &str, compile: &dyn Fn(&Path) ->
     assert_eq!(lines.next().unwrap().parse(), Ok(model.recipe.full_lock_deg), "{name}");
     let answers: Vec<f32> = lines.map(|line| line.parse().unwrap()).collect();
     assert_eq!(answers.len(), pictures.len(), "{name}");
-    let expected: Vec<f32> = pictures.iter().map(|picture| pilot.steer(h, w, picture).unwrap()).collect();
+    let expected: Vec<f32> = pictures
+        .iter()
+        .map(|picture| pilot.steer(ndarray::ArrayView3::from_shape((h, w, 3), picture).unwrap()).unwrap())
+        .collect();
     for (number, (answer, expected)) in answers.iter().zip(&expected).enumerate() {
         let error = (answer - expected).abs() / expected.abs().max(1.0);
         assert!(error <= BOUND, "{name} as {language}, picture {number}: {answer} instead of {expected}");

@@ -4,6 +4,7 @@
 mod common;
 
 use common::formula::{hash, unit};
+use ndarray::{ArrayView1, ArrayView4, ArrayViewMut1};
 use serde::Deserialize;
 use steersman::engine::layers::gradcheck::relative_error;
 use steersman::engine::layers::{Grads, Pair, Pass};
@@ -182,7 +183,8 @@ fn check(name: &str, backend: Backend) {
     let start = parameters(&network);
     let mut inference = steersman::engine::network::InferencePlan::new(&network, golden.batch);
     let mut predictions = vec![f32::NAN; golden.batch];
-    inference.run(&network, &start, &x, &mut predictions);
+    let images = ArrayView4::from_shape(network.input().batch(golden.batch), &x).unwrap();
+    inference.run(&network, &start, images, ArrayViewMut1::from(&mut predictions));
     let last = &network.layers().last().unwrap().name;
     golden.compare(&format!("infer/{last}"), &predictions, FORWARD, &mut failures);
 
@@ -203,7 +205,7 @@ fn check(name: &str, backend: Backend) {
         l2: 0.0,
         decoupled_weight_decay: 0.0,
     };
-    let mut optimizer = Optimizer::new(spec, None, &network);
+    let mut optimizer = Optimizer::new(spec, None, network.tensors(), network.isa());
     // Batch normalisation takes away what a bias right before it adds.
     let cancelled: Vec<String> = network
         .layers()
@@ -213,7 +215,7 @@ fn check(name: &str, backend: Backend) {
         .collect();
     let mut losses = Vec::new();
     for step in 0..=golden.steps {
-        let input = StepInput { x: &x, labels: &labels, seed: 0, step: step as u64 };
+        let input = StepInput { x: images, labels: ArrayView1::from(&labels), seed: 0, step: step as u64 };
         losses.push(plan.step(&network, &mut parameters, &Loss::MeanSquaredError {}, input));
         if step == 0 {
             for tensor in network.tensors().iter().filter(|t| t.trainable) {

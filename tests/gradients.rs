@@ -3,9 +3,10 @@
 //! Each tensor is moved along several random directions of ±1, the loss must change as the gradient says, and the difference
 //! is measured against the norm of the tensor's gradient, which is what a random direction of signs sees of it on average.
 
+use ndarray::{Array1, Array4, ArrayView1, ArrayView4};
 use rand::Rng;
 use steersman::engine::loss::Loss;
-use steersman::engine::network::{Network, Parameters, StepInput, Tensor, TrainingPlan};
+use steersman::engine::network::{LayerSpec, Network, Parameters, StepInput, Tensor, TrainingPlan};
 use steersman::engine::random::{Purpose, rng, uniform, unit};
 use steersman::engine::tensor::Shape;
 use steersman::recipe::Recipe;
@@ -69,7 +70,8 @@ impl Check {
     }
 
     fn loss(&mut self, parameters: &Parameters) -> f64 {
-        let input = StepInput { x: &self.x, labels: &self.labels, seed: 3, step: 4 };
+        let x = ArrayView4::from_shape(self.network.input().batch(IMAGES), &self.x).unwrap();
+        let input = StepInput { x, labels: ArrayView1::from(&self.labels), seed: 3, step: 4 };
         self.plan.step(&self.network, &mut parameters.clone(), &self.loss, input)
     }
 
@@ -164,4 +166,64 @@ fn lenet_at_reduced_size() {
 #[test]
 fn pilotnet_at_reduced_size() {
     check("pilotnet", "[61, 65]");
+}
+
+/// The maps of the convolution are the same everywhere, so every window ties; the images are not, so the gradient of its weights
+/// tells which element of a window was chosen.
+#[test]
+fn of_equals_in_a_pooling_window_the_first_takes_the_gradient() {
+    #[derive(serde::Deserialize)]
+    struct Layers {
+        layers: Vec<LayerSpec>,
+    }
+    const SUM: f32 = 8.0;
+    let (shape, images) = (Shape::new(2, 12, 12), 2);
+    let mut random = rng(12, Purpose::Test, 0, 0);
+    // Two channels that add up to SUM in every position.
+    let first: Vec<f32> = (0..images * 144).map(|_| uniform(&mut random, 0.0, 9.0).floor() as f32).collect();
+    let x = Array4::from_shape_fn(shape.batch(images), |(n, c, h, w)| {
+        let value = first[n * 144 + h * 12 + w];
+        if c == 0 { value } else { SUM - value }
+    });
+    let conv = "{ kind = 'conv2d', filters = 1, kernel = [1, 1], init = { constant = 1.0 } }";
+    let dense = "{ kind = 'dense', units = 1, init = { constant = 1.0 } }";
+    for (between, norm) in
+        [("", false), ("{ kind = 'relu' },", false), ("{ kind = 'batch_norm' }, { kind = 'relu' },", true)]
+    {
+        for window in [2, 3, 4, 6] {
+            let pool = format!("{{ kind = 'max_pool', window = [{window}, {window}] }}");
+            let text = format!("layers = [{conv}, {between} {pool}, {dense}]");
+            let layers = toml::from_str::<Layers>(&text).unwrap().layers;
+            for isa in Isa::available() {
+                let network = Network::new(shape, &layers, isa).unwrap();
+                let mut parameters = network.initialize(1);
+                let windows = (12 / window) * (12 / window);
+                let mut predicted = SUM * windows as f32;
+                if norm {
+                    // The normalised map is 0; beta lifts it over the kink.
+                    parameters.array_mut(network.tensor("bn1.beta").unwrap()).fill(1.0);
+                    predicted = windows as f32;
+                }
+                // The gradient of the loss with respect to each pooled value is 2 / images = 1.
+                let labels = Array1::from_elem(images, predicted - 1.0);
+                let mut plan = TrainingPlan::new(&network, images);
+                let input = StepInput { x: x.view(), labels: labels.view(), seed: 1, step: 0 };
+                plan.step(&network, &mut parameters, &Loss::default(), input);
+
+                let positions = |n: usize| (0..144).map(move |at| (n, at / 12, at % 12));
+                let chosen =
+                    |(_, h, w): (usize, usize, usize)| if h % window == 0 && w % window == 0 { 1.0 } else { 0.0 };
+                // Batch normalisation takes the mean of the gradient off and divides by the root of its epsilon.
+                let (mean, gain) = if norm { (windows as f64 / 144.0, 1e-3f64.sqrt().recip()) } else { (0.0, 1.0) };
+                let weights = &plan.gradient()[network.tensor("conv1.weight").unwrap().range.clone()];
+                for (channel, found) in weights.iter().enumerate() {
+                    let gradient = |(n, h, w)| gain * (chosen((n, h, w)) - mean) * f64::from(x[[n, channel, h, w]]);
+                    let expected: f64 = (0..images).flat_map(positions).map(gradient).sum();
+                    let tolerance = 1e-4 * expected.abs().max(gain);
+                    let difference = (f64::from(*found) - expected).abs();
+                    assert!(difference <= tolerance, "{found} for {expected}: {text} on {}", isa.name());
+                }
+            }
+        }
+    }
 }

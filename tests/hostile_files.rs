@@ -4,7 +4,7 @@
 //! It runs for some seconds; `STEERSMAN_FUZZ_SECONDS=300 cargo test --release --test hostile_files` runs longer, and
 //! `STEERSMAN_FUZZ_SEED=…` begins elsewhere. A failure names its seed, and repeats with it.
 
-use std::io::{Cursor, Read, Write};
+use std::io::Write;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
@@ -16,6 +16,7 @@ use rand_chacha::ChaCha8Rng;
 use steersman::engine::tensor::Shape;
 use steersman::exchange::keras::{ImportOptions, import};
 use steersman::exchange::presets;
+use steersman::files::zip_archive::{ZipArchive, ZipEntry};
 use steersman::model_file::{Model, TrainingRecord};
 use steersman::recipe::Recipe;
 use steersman_kernels::Isa;
@@ -171,24 +172,32 @@ fn import_bytes(folder: &Path, bytes: &[u8], options: &ImportOptions) -> Result<
 
 /// The entries of a `.keras` archive.
 fn entries(name: &str) -> Vec<(String, Vec<u8>)> {
-    let mut archive = zip::ZipArchive::new(std::fs::File::open(golden(name)).unwrap()).unwrap();
-    let read = |i: usize| {
-        let mut entry = archive.by_index(i).unwrap();
-        let mut bytes = Vec::new();
-        entry.read_to_end(&mut bytes).unwrap();
-        (entry.name().unwrap().to_string(), bytes)
-    };
-    (0..3).map(read).collect()
+    let mut file = std::fs::File::open(golden(name)).unwrap();
+    let archive = ZipArchive::open(&mut file).unwrap();
+    let read = |entry: &ZipEntry| (entry.name.clone(), ZipArchive::read(&mut file, entry, 1 << 20).unwrap());
+    archive.entries().iter().map(read).collect()
 }
 
+/// An archive of deflated `entries`.
 fn archive(entries: &[(String, Vec<u8>)]) -> Vec<u8> {
-    let mut writer = zip::ZipWriter::new(Cursor::new(Vec::new()));
-    for (name, bytes) in entries {
-        let options = zip::write::SimpleFileOptions::default().compression_method(zip::CompressionMethod::Deflated);
-        writer.start_file(name.as_str(), options).unwrap();
-        writer.write_all(bytes).unwrap();
+    let (mut bytes, mut directory) = (Vec::new(), Vec::new());
+    for (name, content) in entries {
+        let mut encoder = flate2::write::DeflateEncoder::new(Vec::new(), flate2::Compression::default());
+        encoder.write_all(content).unwrap();
+        let packed = encoder.finish().unwrap();
+        let mut crc = flate2::Crc::new();
+        crc.update(content);
+        let mut common = b"\x14\0\0\0\x08\0\0\0\0\0".to_vec();
+        for number in [crc.sum(), packed.len() as u32, content.len() as u32, name.len() as u32] {
+            common.extend(number.to_le_bytes());
+        }
+        directory.extend([&b"PK\x01\x02\x14\0"[..], &common, &[0; 10], &(bytes.len() as u32).to_le_bytes()].concat());
+        directory.extend(name.as_bytes());
+        bytes.extend([&b"PK\x03\x04"[..], &common, name.as_bytes(), &packed].concat());
     }
-    writer.finish().unwrap().into_inner()
+    let end = [directory.len() as u32, bytes.len() as u32].map(u32::to_le_bytes).concat();
+    let count = (entries.len() as u16).to_le_bytes();
+    [&bytes[..], &directory, b"PK\x05\x06\0\0\0\0", &count, &count, &end, &[0; 2]].concat()
 }
 
 #[test]

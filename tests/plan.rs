@@ -3,8 +3,9 @@
 
 use std::sync::{Mutex, PoisonError};
 
+use ndarray::{Array1, ArrayView1, ArrayView4, Axis};
 use steersman::engine::loss::Loss;
-use steersman::engine::network::{InferencePlan, LayerSpec, Network, Parameters, StepInput, TrainingPlan};
+use steersman::engine::network::{InferencePlan, LayerSpec, Network, Parameters, Predictor, StepInput, TrainingPlan};
 use steersman::engine::optimizer::Optimizer;
 use steersman::engine::random::{Purpose, rng, uniform};
 use steersman::engine::tensor::Shape;
@@ -41,12 +42,33 @@ impl Setup {
         Setup { recipe, network, x, labels }
     }
 
+    /// The same network with ELUs of `alpha` for its activations.
+    fn with_elu(self, alpha: f32) -> Setup {
+        let text = format!("{{ kind = 'elu', alpha = {alpha:?} }}");
+        let elu: LayerSpec =
+            toml::from_str::<toml::Table>(&format!("layer = {text}")).unwrap()["layer"].clone().try_into().unwrap();
+        let name = elu.base_name();
+        let layers: Vec<LayerSpec> = self
+            .recipe
+            .layers
+            .iter()
+            .map(|layer| if layer.base_name() == name { elu.clone() } else { layer.clone() })
+            .collect();
+        assert_ne!(layers.iter().filter(|layer| **layer == elu).count(), 0);
+        Setup { network: Network::new(self.network.input(), &layers, Isa::best()).unwrap(), ..self }
+    }
+
+    fn images(&self) -> ArrayView4<'_, f32> {
+        images(&self.network, &self.x)
+    }
+
     fn optimizer(&self) -> Optimizer {
-        Optimizer::new(self.recipe.optimizer, Some(0.1), &self.network)
+        Optimizer::new(self.recipe.optimizer, Some(0.1), self.network.tensors(), self.network.isa())
     }
 
     fn step(&self, plan: &mut TrainingPlan, optimizer: &mut Optimizer, parameters: &mut Parameters) -> f64 {
-        let input = StepInput { x: &self.x, labels: &self.labels, seed: 1, step: optimizer.updates };
+        let input =
+            StepInput { x: self.images(), labels: ArrayView1::from(&self.labels), seed: 1, step: optimizer.updates };
         let loss = plan.step(&self.network, parameters, &self.recipe.loss, input);
         let norm = plan.gradient_norm();
         optimizer.step(1e-3, &mut parameters.values, plan.gradient_mut(), norm);
@@ -63,6 +85,11 @@ impl Setup {
             (losses, parameters)
         })
     }
+}
+
+/// The images in `x` as an array.
+fn images<'a>(network: &Network, x: &'a [f32]) -> ArrayView4<'a, f32> {
+    ArrayView4::from_shape(network.input().batch(x.len() / network.input().len()), x).unwrap()
 }
 
 const NETWORKS: [(&str, &str); 3] = [("hyper", "[40, 44]"), ("lenet", "[30, 26]"), ("pilotnet", "[61, 65]")];
@@ -130,9 +157,13 @@ fn a_prediction_allocates_nothing() {
     for (recipe, size) in NETWORKS {
         let setup = Setup::new(recipe, size, 1);
         let (parameters, mut plan) = (setup.network.initialize(1), InferencePlan::new(&setup.network, 1));
-        plan.run(&setup.network, &parameters, &setup.x, &mut [0.0]);
-        let allocated = allocations(|| plan.run(&setup.network, &parameters, &setup.x, &mut [0.0]));
+        let mut y = Array1::zeros(1);
+        plan.run(&setup.network, &parameters, setup.images(), y.view_mut());
+        let allocated = allocations(|| plan.run(&setup.network, &parameters, setup.images(), y.view_mut()));
         assert_eq!(allocated, 0, "{recipe}");
+        let mut predictor = Predictor::new(setup.recipe.network(Isa::best()).unwrap(), parameters, 1);
+        let allocated = allocations(|| predictor.run(setup.images(), y.view_mut()));
+        assert_eq!(allocated, 0, "{recipe} with packed weights");
     }
 }
 
@@ -159,10 +190,10 @@ fn a_prediction_does_not_depend_on_the_other_images() {
     for (recipe, size) in NETWORKS {
         let setup = Setup::new(recipe, size, 21);
         let parameters = setup.network.initialize(1);
-        let (mut together, mut single) = ([f32::NAN; 21], [f32::NAN; 21]);
-        InferencePlan::new(&setup.network, 21).run(&setup.network, &parameters, &setup.x, &mut together);
+        let (mut together, mut single) = (Array1::from_elem(21, f32::NAN), Array1::from_elem(21, f32::NAN));
+        InferencePlan::new(&setup.network, 21).run(&setup.network, &parameters, setup.images(), together.view_mut());
         let mut plan = InferencePlan::new(&setup.network, 1);
-        for (x, y) in setup.x.chunks(setup.network.input().len()).zip(single.chunks_mut(1)) {
+        for (x, y) in setup.images().axis_chunks_iter(Axis(0), 1).zip(single.axis_chunks_iter_mut(Axis(0), 1)) {
             plan.run(&setup.network, &parameters, x, y);
         }
         for (a, b) in together.iter().zip(single) {
@@ -174,11 +205,12 @@ fn a_prediction_does_not_depend_on_the_other_images() {
 /// The share of the labels' variance that is left after learning, as the mean of the last hundred steps.
 fn unexplained_variance(setup: &Setup, network: &Network, seed: u64) -> f64 {
     let mut plan = TrainingPlan::new(network, 8);
-    let mut optimizer = Optimizer::new(setup.recipe.optimizer, None, network);
+    let mut optimizer = Optimizer::new(setup.recipe.optimizer, None, network.tensors(), network.isa());
     let mut parameters = network.initialize(seed);
     let losses: Vec<f64> = (0..1000)
         .map(|_| {
-            let input = StepInput { x: &setup.x, labels: &setup.labels, seed, step: optimizer.updates };
+            let labels = ArrayView1::from(&setup.labels);
+            let input = StepInput { x: setup.images(), labels, seed, step: optimizer.updates };
             let loss = plan.step(network, &mut parameters, &Loss::default(), input);
             let norm = plan.gradient_norm();
             optimizer.step(1e-3, &mut parameters.values, plan.gradient_mut(), norm);
@@ -209,10 +241,32 @@ fn a_network_can_learn_eight_images_by_heart() {
     }
 }
 
+/// Two networks of the same sizes, with another slope: all buffers would fit, so nothing but the plan itself can tell.
+#[test]
+#[should_panic(expected = "a training plan for another network")]
+fn a_training_plan_refuses_another_network_of_the_same_sizes() {
+    let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
+    let elu = |alpha| Setup::new("pilotnet", "[61, 65]", 2).with_elu(alpha);
+    let (planned, other) = (elu(1.0), elu(0.5));
+    let mut plan = TrainingPlan::new(&planned.network, 2);
+    other.step(&mut plan, &mut other.optimizer(), &mut other.network.initialize(1));
+}
+
+/// Frozen layers have no barrier, so a plan from before the freeze would wait for one that never comes.
+#[test]
+#[should_panic(expected = "a training plan for another network")]
+fn a_training_plan_refuses_its_network_once_layers_are_frozen() {
+    let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
+    let mut setup = Setup::new("hyper", "[40, 44]", 2);
+    let mut plan = TrainingPlan::new(&setup.network, 2);
+    setup.network.freeze(&["bn1".into()]).unwrap();
+    setup.step(&mut plan, &mut setup.optimizer(), &mut setup.network.initialize(1));
+}
+
 /// Mean squared error in evaluation.
 fn evaluation_loss(network: &Network, parameters: &Parameters, x: &[f32], labels: &[f32]) -> f64 {
-    let mut y = vec![0.0; labels.len()];
-    InferencePlan::new(network, labels.len()).run(network, parameters, x, &mut y);
+    let mut y = Array1::zeros(labels.len());
+    InferencePlan::new(network, labels.len()).run(network, parameters, images(network, x), y.view_mut());
     y.iter().zip(labels).map(|(y, label)| f64::from(y - label).powi(2)).sum::<f64>() / labels.len() as f64
 }
 
@@ -240,7 +294,7 @@ fn gradients_around_frozen_layers_are_those_of_evaluation_and_frozen_layers_have
 
         let mut plan = TrainingPlan::new(&network, 4);
         let before = parameters.clone();
-        let input = StepInput { x: &x, labels: &labels, seed: 1, step: 0 };
+        let input = StepInput { x: images(&network, &x), labels: ArrayView1::from(&labels), seed: 1, step: 0 };
         let loss = plan.step(&network, &mut parameters, &Loss::default(), input);
         assert!((loss - evaluation_loss(&network, &before, &x, &labels)).abs() < 1e-5);
         assert_eq!(parameters, before, "a step moves no frozen statistics");

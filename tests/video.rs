@@ -2,26 +2,23 @@
 
 mod common;
 
-use std::fs::{self, File};
+use std::fs;
 use std::io::BufReader;
 use std::path::Path;
 use std::process::{Command, Stdio};
 
 use common::command::{error, json, run, steersman};
-use common::painted_log;
+use common::{mp4, painted_log};
+use steersman::picture::RgbImage;
+use steersman::report::video::file::VideoFile;
 
 /// Pictures, seconds, width and height of a video.
 fn read(path: &Path) -> (u32, f64, u16, u16) {
-    let file = File::open(path).unwrap();
-    let size = file.metadata().unwrap().len();
-    let mut reader = mp4::Mp4Reader::read_header(BufReader::new(file), size).unwrap();
-    let track = &reader.tracks()[&1];
-    assert_eq!(track.media_type().unwrap(), mp4::MediaType::H264);
-    let (pictures, width, height) = (track.sample_count(), track.width(), track.height());
-    let first = reader.read_sample(1, 1).unwrap().unwrap();
-    assert!(first.is_sync && !reader.read_sample(1, pictures).unwrap().unwrap().bytes.is_empty());
+    let video = mp4::read(path);
+    let (pictures, (width, height)) = (video.samples.len() as u32, video.size);
+    assert!(video.samples[0].is_key && video.samples.iter().all(|sample| !sample.bytes.is_empty()));
     check_with_ffprobe(path, pictures);
-    (pictures, reader.duration().as_secs_f64(), width, height)
+    (pictures, video.seconds[0], width, height)
 }
 
 /// A decoder of other people must find as many pictures, and nothing to complain about.
@@ -41,6 +38,37 @@ fn check_with_ffprobe(path: &Path, pictures: u32) {
 
 fn seconds(value: &serde_json::Value) -> f64 {
     value["seconds"].as_f64().unwrap()
+}
+
+#[test]
+fn a_video_can_be_read_again_with_its_pictures_times_and_places_to_jump_to() {
+    let scratch = tempfile::tempdir().unwrap();
+    let path = scratch.path().join("a.mp4");
+    let mut video = VideoFile::create(&path, [96, 128], 10.0).unwrap();
+    for k in 0..45 {
+        let pixels = (0..96 * 128).flat_map(|at| [(at / 128 + 3 * k) as u8, (at % 128) as u8, 90]).collect();
+        video.write(&RgbImage { height: 96, width: 128, pixels }).unwrap();
+    }
+    assert!(!path.exists());
+    let summary = video.finish().unwrap();
+    let size = fs::metadata(&path).unwrap().len();
+    assert_eq!((summary.frames, summary.fps, summary.seconds, summary.bytes), (45, 10.0, 4.5, size));
+    let read = mp4::read(&path);
+    assert_eq!((read.seconds, read.size, read.profile, read.samples.len()), ([4.5; 2], (128, 96), 77, 45));
+    for (k, sample) in read.samples.iter().enumerate() {
+        assert!((sample.start_s - 0.1 * k as f64).abs() < 1e-9 && sample.is_key == (k % 20 == 0), "{k}");
+        // Lengths lead from unit to unit to the end; a picture that stands alone has a unit of type 5.
+        let (mut rest, mut kinds) = (&sample.bytes[..], vec![]);
+        while let Some((length, tail)) = rest.split_first_chunk::<4>() {
+            kinds.push(tail[0] & 0x1f);
+            rest = &tail[u32::from_be_bytes(*length) as usize..];
+        }
+        assert!(
+            rest.is_empty() && kinds.contains(&5) == sample.is_key && kinds.contains(&1) != sample.is_key,
+            "{kinds:?}"
+        );
+    }
+    check_with_ffprobe(&path, 45);
 }
 
 #[test]

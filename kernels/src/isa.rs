@@ -45,6 +45,10 @@ impl Isa {
 
     /// Every instruction set this processor can run, from [`Isa::PORTABLE`] to the widest.
     pub fn available() -> Vec<Isa> {
+        #[cfg_attr(
+            not(any(target_arch = "aarch64", target_arch = "x86_64")),
+            expect(unused_mut, reason = "other architectures have the portable level alone")
+        )]
         let mut found = vec![Isa::PORTABLE];
         #[cfg(target_arch = "aarch64")]
         if std::arch::is_aarch64_feature_detected!("neon") {

@@ -3,6 +3,7 @@
 use std::time::Instant;
 
 use clap::Args;
+use ndarray::{ArrayView1, ArrayView4, ArrayViewMut1};
 use rayon::prelude::*;
 use serde::Serialize;
 use steersman_kernels::conv::ConvAlgorithm;
@@ -10,7 +11,7 @@ use steersman_kernels::peak::measure_peak_gflops;
 use steersman_kernels::{Backend, Isa};
 
 use super::{RecipeArgs, pool, print_json};
-use crate::engine::network::{InferencePlan, Network, Parameters, StageTime, StepInput, TrainingPlan};
+use crate::engine::network::{InferencePlan, Network, Parameters, Predictor, StageTime, StepInput, TrainingPlan};
 use crate::engine::optimizer::Optimizer;
 use crate::engine::random::{Purpose, rng, uniform};
 use crate::engine::stopwatch::Stopwatch;
@@ -136,12 +137,17 @@ fn measure(recipe: &Recipe, args: &BenchArgs, started: Instant) -> Result<BenchR
     let labels: Vec<Vec<f32>> = (0..BATCHES).map(|batch| random_numbers(args.batch, 1 << 32 | batch as u64)).collect();
 
     let mut plan = TrainingPlan::new(&network, args.batch);
-    let mut optimizer = Optimizer::new(recipe.optimizer, recipe.clip_gradient_norm, &network);
+    let mut optimizer = Optimizer::new(recipe.optimizer, recipe.clip_gradient_norm, network.tensors(), network.isa());
     let mut step = 0;
     let mut train_step =
         |plan: &mut TrainingPlan, optimizer: &mut Optimizer, x: &[Vec<f32>], parameters: &mut Parameters| {
             let batch = step % BATCHES;
-            let input = StepInput { x: &x[batch], labels: &labels[batch], seed: 1, step: step as u64 };
+            let input = StepInput {
+                x: images(&network, &x[batch]),
+                labels: ArrayView1::from(&labels[batch]),
+                seed: 1,
+                step: step as u64,
+            };
             plan.step(&network, parameters, &recipe.loss, input);
             let norm = plan.gradient_norm();
             optimizer.step(recipe.optimizer.learning_rate(), &mut parameters.values, plan.gradient_mut(), norm);
@@ -171,7 +177,7 @@ fn measure(recipe: &Recipe, args: &BenchArgs, started: Instant) -> Result<BenchR
     });
 
     let infer_images_per_second = infer_throughput(&network, &parameters, &x, args);
-    let (infer_us_p50, infer_us_p99) = infer_latency(&network, &parameters, &x[0], args.seconds);
+    let (infer_us_p50, infer_us_p99) = infer_latency(recipe.network(Isa::best())?, parameters, &x[0], args.seconds);
     let peaks = rayon::broadcast(|_| measure_peak_gflops(network.isa(), args.seconds.min(1.0)));
     Ok(BenchResult {
         train_images_per_second,
@@ -240,27 +246,34 @@ fn random_numbers(len: usize, stream: u64) -> Vec<f32> {
     numbers
 }
 
+/// The images in `x`, `(n, c, h, w)`.
+fn images<'a>(network: &Network, x: &'a [f32]) -> ArrayView4<'a, f32> {
+    let n = x.len() / network.input().len();
+    ArrayView4::from_shape(network.input().batch(n), x).expect("whole images")
+}
+
 fn infer_throughput(network: &Network, parameters: &Parameters, x: &[Vec<f32>], args: &BenchArgs) -> f64 {
     let mut plan = InferencePlan::new(network, args.batch);
     let mut y = vec![0.0; args.batch];
-    plan.run(network, parameters, &x[0], &mut y);
+    plan.run(network, parameters, images(network, &x[0]), ArrayViewMut1::from(&mut y));
     let (mut batches, started) = (0, Instant::now());
     while started.elapsed().as_secs_f64() < args.seconds {
-        plan.run(network, parameters, &x[batches % BATCHES], &mut y);
+        plan.run(network, parameters, images(network, &x[batches % BATCHES]), ArrayViewMut1::from(&mut y));
         batches += 1;
     }
     (batches * args.batch) as f64 / started.elapsed().as_secs_f64()
 }
 
 /// Median and 99th percentile of the time for one image, in microseconds.
-fn infer_latency(network: &Network, parameters: &Parameters, x: &[f32], seconds: f64) -> (f64, f64) {
-    let mut plan = InferencePlan::new(network, 1);
-    plan.prepare(network, parameters);
+fn infer_latency(network: Network, parameters: Parameters, x: &[f32], seconds: f64) -> (f64, f64) {
+    let mut predictor = Predictor::new(network, parameters, 1);
     let mut times = Vec::new();
     let started = Instant::now();
-    for image in x.chunks_exact(network.input().len()).cycle() {
+    let image_len = predictor.network().input().len();
+    for image in x.chunks_exact(image_len).cycle() {
+        let image = images(predictor.network(), image);
         let before = Instant::now();
-        plan.run_prepared(network, parameters, image, &mut [0.0]);
+        predictor.run(image, ArrayViewMut1::from(&mut [0.0]));
         times.push(before.elapsed().as_secs_f64() * 1e6);
         if started.elapsed().as_secs_f64() >= seconds {
             break;

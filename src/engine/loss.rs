@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-/// What training makes small. Both are means over the batch, as in Keras.
+/// The function that training minimizes: a mean over the batch, as in Keras.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
 pub enum Loss {
@@ -10,7 +10,7 @@ pub enum Loss {
     MeanSquaredError {},
     /// Mean of the Huber loss (1964): `error² / 2` for `|error| ≤ delta`, else `delta · (|error| − delta / 2)`.
     Huber {
-        /// Where the square turns into a line, in units of the label.
+        /// The absolute error at which the square turns into a line, in units of the label.
         delta: f32,
     },
 }

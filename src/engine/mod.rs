@@ -5,6 +5,7 @@ pub mod layers;
 pub mod loss;
 pub mod network;
 pub mod optimizer;
+pub mod parameters;
 pub mod random;
 pub mod stopwatch;
 pub mod tensor;

@@ -1,4 +1,4 @@
-//! Random numbers that depend on what they are for, never on when or on which thread they are drawn.
+//! Random numbers keyed by their purpose: they depend neither on the time nor on the thread of the draw.
 //!
 //! Every random choice of a run is keyed by (seed, epoch, sample, purpose). The key names one stream of the ChaCha8
 //! block cipher in counter mode, so any thread can open any stream at any time and reads the same numbers: this is why
@@ -10,7 +10,7 @@
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-/// What random numbers are drawn for. The numbers are part of what a seed means and never change.
+/// The purpose of a random stream. The discriminants are part of the meaning of a seed and never change.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u64)]
 pub enum Purpose {

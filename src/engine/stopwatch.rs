@@ -1,15 +1,13 @@
-//! How long threads work on a part of the work, summed over all of them.
+//! A stopwatch for one kind of work, summed over threads.
 //!
-//! What counts is the CPU time of the thread, so that neither other programs nor a slow disk make a part look large; where the
-//! system does not tell it, the time on the clock.
+//! It counts CPU time of the thread, which neither other programs nor a slow disk prolong; where the system does not provide it,
+//! and in an engine that is compiled alone, wall time.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-use cpu_time::ThreadTime;
-
-/// Adds up the time of what it is given to run. One that is off, the default, only runs it. Clones share the sum.
+/// Runs work and sums its time. A stopwatch that is off (the default) only runs the work. Clones share the sum.
 #[derive(Clone, Debug, Default)]
 pub struct Stopwatch(Option<Arc<AtomicU64>>);
 
@@ -19,15 +17,16 @@ impl Stopwatch {
         Stopwatch(Some(Arc::default()))
     }
 
-    /// Runs `work`. It should not wait for other threads: while it waits, rayon lets it do their work.
+    /// Runs `work` and adds its time. `work` should not wait for other threads: a waiting rayon thread runs their tasks, which would
+    /// count here.
     #[inline]
     pub fn time<T>(&self, work: impl FnOnce() -> T) -> T {
         if self.0.is_none() {
             return work();
         }
-        let (clock, cpu) = (Instant::now(), ThreadTime::try_now());
+        let elapsed = thread_clock();
         let result = work();
-        self.add(cpu.map_or_else(|_| clock.elapsed(), |cpu| cpu.elapsed()));
+        self.add(elapsed());
         result
     }
 
@@ -42,6 +41,20 @@ impl Stopwatch {
     pub fn seconds(&self) -> f64 {
         self.0.as_ref().map_or(0.0, |nanoseconds| nanoseconds.load(Ordering::Relaxed) as f64 * 1e-9)
     }
+}
+
+/// Starts a clock of this thread, and answers what reads it.
+#[cfg(feature = "training")]
+fn thread_clock() -> impl Fn() -> Duration {
+    let (clock, cpu) = (Instant::now(), cpu_time::ThreadTime::try_now());
+    move || cpu.as_ref().map_or_else(|_| clock.elapsed(), cpu_time::ThreadTime::elapsed)
+}
+
+/// Starts a clock, and answers what reads it.
+#[cfg(not(feature = "training"))]
+fn thread_clock() -> impl Fn() -> Duration {
+    let clock = Instant::now();
+    move || clock.elapsed()
 }
 
 #[cfg(test)]

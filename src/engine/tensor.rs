@@ -32,17 +32,22 @@ impl Shape {
         Shape { c: units, h: 1, w: 1 }
     }
 
-    /// How many numbers one image has.
+    /// Shape of an array of `n` images: `(n, c, h, w)`.
+    pub const fn batch(self, n: usize) -> (usize, usize, usize, usize) {
+        (n, self.c, self.h, self.w)
+    }
+
+    /// Length of one image: c · h · w.
     pub const fn len(self) -> usize {
         self.c * self.h * self.w
     }
 
-    /// Whether there is no number at all.
+    /// Whether an image is empty.
     pub const fn is_empty(self) -> bool {
         self.len() == 0
     }
 
-    /// How many positions each channel has.
+    /// Positions of a channel: h · w.
     pub const fn positions(self) -> usize {
         self.h * self.w
     }
@@ -55,7 +60,7 @@ impl fmt::Display for Shape {
     }
 }
 
-/// How a tensor gets its first values.
+/// Initial values of a tensor.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum Initializer {
@@ -68,7 +73,7 @@ pub enum Initializer {
     Constant(f32),
 }
 
-/// How many inputs feed, and how many outputs are fed by, one element of a weight tensor.
+/// Number of inputs that feed one output (fan-in), and of outputs that one input feeds (fan-out).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Fans {
     /// Inputs of one output: input channels times kernel positions.

@@ -7,6 +7,7 @@
 
 use std::path::Path;
 
+use ndarray::{ArrayView4, ArrayViewMut1};
 use rayon::prelude::*;
 
 use crate::dataset::colour::Colour;
@@ -202,7 +203,6 @@ fn judge(
     let [height, width] = preprocessing.source;
     let mut preprocessor = preprocessing.plan(height, width)?;
     let mut plan = InferencePlan::new(network, 1);
-    plan.prepare(network, parameters);
     let mut planes = vec![0; preprocessing.output_len()];
     let mut input = vec![0.0; preprocessing.output_len()];
     let mut pairs = Vec::new();
@@ -210,7 +210,8 @@ fn judge(
         preprocessor.apply(&frames.images[index].pixels, &mut planes);
         preprocessing.to_input(&planes, &mut input);
         let mut steering = [0.0];
-        plan.run_prepared(network, parameters, &input, &mut steering);
+        let x = ArrayView4::from_shape(network.input().batch(1), &input).expect("an image of the input's shape");
+        plan.run(network, parameters, x, ArrayViewMut1::from(&mut steering));
         pairs.push((f64::from(steering[0]), f64::from(frames.labels[index])));
     }
     Ok(correlation(pairs.into_iter()))

@@ -5,6 +5,7 @@
 
 pub(crate) mod chain;
 pub mod fit;
+#[cfg(feature = "keras")]
 pub mod keras;
 pub mod onnx;
 pub mod presets;

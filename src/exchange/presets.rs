@@ -2,17 +2,11 @@
 
 use crate::dataset::preprocess::Preprocessing;
 use crate::error::{Error, Result};
-use crate::recipe::{Recipe, SHIPPED, did_you_mean};
+use crate::recipe::{Recipe, SHIPPED};
+use crate::suggestion::did_you_mean;
 
-/// Name and text of each preset; the files say where they come from.
-pub const PRESETS: [(&str, &str); 6] = [
-    ("naokishibuya", include_str!("../../data/preprocessing/naokishibuya.toml")),
-    ("naokishibuya-2017-01-14", include_str!("../../data/preprocessing/naokishibuya-2017-01-14.toml")),
-    ("diz-vara", include_str!("../../data/preprocessing/diz-vara.toml")),
-    ("oargueta", include_str!("../../data/preprocessing/oargueta.toml")),
-    ("udacity", include_str!("../../data/preprocessing/udacity.toml")),
-    ("udacity-bgr", include_str!("../../data/preprocessing/udacity-bgr.toml")),
-];
+/// Name and text of each file in `data/preprocessing/`, by name; the files say where they come from.
+pub const PRESETS: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/preprocessing.rs"));
 
 /// The preprocessing `name`: a preset, that of a built-in recipe, or a TOML file (the table alone, or a recipe's).
 ///
@@ -29,7 +23,7 @@ pub fn find(name: &str) -> Result<Preprocessing> {
     if name.ends_with(".toml") || std::path::Path::new(name).components().count() > 1 {
         return parse(name, &std::fs::read_to_string(name).map_err(Error::io(name))?);
     }
-    let names: Vec<&str> = PRESETS.iter().chain(&SHIPPED).map(|(name, _)| *name).collect();
+    let names: Vec<&str> = PRESETS.iter().chain(SHIPPED).map(|(name, _)| *name).collect();
     Err(Error::Usage(format!(
         "there is no preprocessing `{name}`{}; built in are {}; one of your own is given as FILE.toml",
         did_you_mean(name, &names),

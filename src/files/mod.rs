@@ -6,3 +6,4 @@ pub(crate) mod limits;
 pub(crate) mod lock;
 pub mod new_folder;
 pub(crate) mod unfinished;
+pub mod zip_archive;

@@ -105,7 +105,7 @@ impl Watch<'_> {
         jpeg::encode(frame.picture, &mut self.camera_jpeg)?;
         let mut saliency_jpeg = Vec::new();
         if let Some((pilot, saliency)) = &mut self.saliency {
-            saliency.steer(pilot, HEIGHT, WIDTH, &frame.picture.pixels)?;
+            saliency.steer(pilot, frame.picture.view())?;
             self.image.pixels.copy_from_slice(&frame.picture.pixels);
             saliency.overlay(&pilot.recipe().preprocessing, &mut self.image);
             saliency_jpeg = self.image.to_jpeg();

@@ -18,7 +18,7 @@ use crate::simulator::camera::front_camera::FrontCamera;
 use crate::simulator::recorder::expert_drive::drive_expert;
 use crate::simulator::trial::drive::drive;
 use crate::simulator::trial::trajectory::write_trajectories;
-use crate::simulator::{DriveOptions, DriveSummary, Driver, HEIGHT, RecordOptions, Track, WIDTH};
+use crate::simulator::{DriveOptions, DriveSummary, Driver, RecordOptions, Track};
 use crate::training::TrainResult;
 
 /// Tracks that the main job drives on: those of the training set, then held-out ones.
@@ -104,7 +104,7 @@ pub fn offline_mae_deg(pilot: &Pilot, track: &Track, seed: u64) -> Result<f64> {
     let count = samples.len().min(OFFLINE_FRAMES);
     for sample in spread(samples.len(), count).map(|k| &samples[k]) {
         let frame = eye.look_from(&sample.body)?;
-        let steering = pilot.steer(HEIGHT, WIDTH, &frame.pixels)?;
+        let steering = pilot.steer(frame.view())?;
         sum += (f64::from(steering) - sample.steering).abs();
     }
     Ok(sum / count as f64 * pilot.recipe().full_lock_deg)

@@ -1,7 +1,6 @@
 //! Encoding of pictures as JPEG and PNG, and as `data:` addresses for pages that stand alone.
 
-use base64::Engine as _;
-use base64::engine::general_purpose::STANDARD;
+use data_encoding::BASE64;
 use image::{ExtendedColorType, ImageEncoder};
 
 use super::RgbImage;
@@ -36,12 +35,12 @@ impl RgbImage {
 
     /// The picture as JPEG in a `data:` address.
     pub(crate) fn jpeg_address(&self) -> String {
-        format!("data:image/jpeg;base64,{}", STANDARD.encode(self.to_jpeg()))
+        format!("data:image/jpeg;base64,{}", BASE64.encode(&self.to_jpeg()))
     }
 
     /// The picture as PNG in a `data:` address.
     pub(crate) fn png_address(&self) -> String {
-        format!("data:image/png;base64,{}", STANDARD.encode(self.to_png()))
+        format!("data:image/png;base64,{}", BASE64.encode(&self.to_png()))
     }
 }
 
@@ -57,7 +56,7 @@ mod tests {
         decode_rgb(&picture.to_png(), &mut decoded).unwrap();
         assert_eq!(decoded, picture);
         let address = picture.jpeg_address();
-        let bytes = STANDARD.decode(address.strip_prefix("data:image/jpeg;base64,").unwrap()).unwrap();
+        let bytes = BASE64.decode(address.strip_prefix("data:image/jpeg;base64,").unwrap().as_bytes()).unwrap();
         decode_rgb(&bytes, &mut decoded).unwrap();
         assert_eq!((decoded.height, decoded.width), (5, 9));
         assert!(RgbImage::default().to_png().is_empty() && RgbImage::default().to_jpeg().is_empty());

@@ -6,6 +6,8 @@ pub mod decode;
 mod draw;
 mod encode;
 
+use ndarray::ArrayView3;
+
 /// An 8-bit RGB picture, `[height][width][3]`. The buffer is reused from picture to picture.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct RgbImage {
@@ -18,6 +20,15 @@ pub struct RgbImage {
 }
 
 impl RgbImage {
+    /// The pixels as an array, `(height, width, 3)`.
+    ///
+    /// # Panics
+    ///
+    /// Panics if there are not `height · width · 3` bytes of them.
+    pub fn view(&self) -> ArrayView3<'_, u8> {
+        ArrayView3::from_shape((self.height, self.width, 3), &self.pixels).expect("height · width · 3 bytes")
+    }
+
     /// A picture of one colour.
     pub(crate) fn filled(height: usize, width: usize, rgb: [u8; 3]) -> RgbImage {
         RgbImage { height, width, pixels: rgb.repeat(height * width) }

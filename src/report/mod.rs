@@ -7,4 +7,5 @@ pub mod charts;
 pub mod explain;
 pub mod pages;
 pub mod tone;
+#[cfg(feature = "video")]
 pub mod video;

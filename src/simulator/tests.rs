@@ -58,6 +58,7 @@ fn held_out_tracks_look_like_no_training_track() {
         assert_eq!(reserved(&Track::load(name).unwrap())[..4], [true; 4], "{name}");
     }
     assert!(reserved(&Track::load("coast").unwrap())[4]);
+    #[cfg(feature = "cli")]
     for take in crate::main_job::training_set::takes() {
         assert_eq!(reserved(&Track::load(&take.track).unwrap()), [false; 5], "{}", take.track);
     }

@@ -1,4 +1,4 @@
-//! Where a run stands, on disk: enough to go on as if it had never stopped.
+//! The state of a run on disk: a resumed run gives the same bits as one that never stopped.
 
 use std::path::Path;
 
@@ -17,46 +17,46 @@ const BEST: &str = "best.";
 
 /// Everything that changes during a run.
 #[derive(Clone, Debug)]
-pub struct State {
+pub(super) struct State {
     /// The weights as they are now.
     pub parameters: Parameters,
-    /// Its clock and moving averages.
+    /// Number of updates and moving averages.
     pub optimizer: Optimizer,
     /// The weights of the best epoch so far.
     pub best: Option<Parameters>,
-    /// The small numbers.
+    /// Counters and measures.
     pub progress: Progress,
 }
 
-/// The small numbers of [`State`].
+/// Counters and measures of [`State`].
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Progress {
-    /// The epoch under way, from 0.
+pub(super) struct Progress {
+    /// The current epoch, from 0; the next five fields belong to it.
     pub epoch: u32,
-    /// Its next batch.
+    /// The next batch of the epoch.
     pub next_batch: usize,
-    /// Losses of its batches so far, each times its images.
+    /// Sum of the losses of its images so far.
     pub loss_sum: f64,
-    /// Its images so far.
+    /// Images trained on so far.
     pub images: usize,
-    /// Its training time so far.
+    /// Training time so far, seconds.
     pub train_seconds: f64,
     /// Learning rate of the last update.
     pub learning_rate: f64,
-    /// Which epoch the best weights are of, from 1.
+    /// The epoch of the best weights, from 1.
     pub best_epoch: u32,
-    /// Their validation loss.
+    /// Validation loss of the best weights.
     pub best_val_mse: Option<f64>,
-    /// Epochs since the validation loss last improved by the recipe's `min_delta`, and what it was then.
+    /// Epochs since the validation loss last improved by the recipe's `min_delta`.
     pub epochs_since_improvement: u32,
-    /// Validation loss at that improvement.
+    /// Validation loss at the last improvement.
     pub improved_val_mse: Option<f64>,
-    /// What the learning-rate schedule remembers.
+    /// State of the learning-rate schedule.
     pub plateau: Plateau,
     /// The epochs that are done.
     pub history: Vec<EpochRecord>,
-    /// Wall time of the run so far.
+    /// Wall time of the run so far, seconds.
     pub seconds: f64,
 }
 
@@ -132,7 +132,7 @@ mod tests {
         let spec = OptimizerSpec::Sgd { learning_rate: 0.1, momentum: 0.9, l2: 0.0, decoupled_weight_decay: 0.0 };
         let mut state = State {
             parameters: network.initialize(1),
-            optimizer: Optimizer::new(spec, None, &network),
+            optimizer: Optimizer::new(spec, None, network.tensors(), network.isa()),
             best: Some(network.initialize(2)),
             progress: Progress { epoch: 3, loss_sum: 0.1 + 0.2, best_val_mse: Some(1.0 / 3.0), ..Progress::default() },
         };
@@ -141,7 +141,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("checkpoint.safetensors");
         state.save(&path, &network).unwrap();
-        let read = State::load(&path, &network, Optimizer::new(spec, None, &network)).unwrap();
+        let read = State::load(&path, &network, Optimizer::new(spec, None, network.tensors(), network.isa())).unwrap();
         assert_eq!(read.parameters, state.parameters);
         assert_eq!(read.best, state.best);
         assert_eq!(read.progress, state.progress);

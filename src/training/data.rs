@@ -1,22 +1,29 @@
-//! What a run trains and validates on: recordings, split and loaders.
+//! The data of a run: recordings, split, and the loaders of both sides.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use ndarray::ArrayView4;
 use sha2::{Digest, Sha256};
 
 use crate::dataset::cache::{CacheSpec, Overflow};
 use crate::dataset::leak::LeakAudit;
-use crate::dataset::loader::{Loader, LoaderSpec};
+use crate::dataset::loader::{Batch, Loader, LoaderSpec};
 use crate::dataset::split::{Split, split};
 use crate::dataset::{self, Item, Recording};
+use crate::engine::tensor::Shape;
 use crate::error::{Error, Result};
 use crate::files::atomic_file;
 use crate::recipe::Recipe;
 
+/// The images of `batch`, `(n, c, h, w)`, for a network whose input is `input`.
+pub(super) fn images(input: Shape, batch: &Batch) -> ArrayView4<'_, f32> {
+    ArrayView4::from_shape(input.batch(batch.n), &batch.x).expect("a loader makes images of the network's input shape")
+}
+
 /// Recordings that have been read and split.
 #[derive(Debug)]
-pub struct Data {
+pub(crate) struct Data {
     recordings: Arc<[Recording]>,
     split: Split,
     leak: LeakAudit,
@@ -58,7 +65,7 @@ impl Data {
         Ok(Data { recordings: recordings.into(), split, leak, loader, notices })
     }
 
-    /// What the user should know of the recordings and the split.
+    /// Messages for the user about the recordings and the split.
     pub fn notices(&self) -> &[String] {
         &self.notices
     }
@@ -86,7 +93,7 @@ impl Data {
         ids
     }
 
-    /// How many validation rows are among the [`Recording::row_id`]s `rows`, which are sorted; and how many there are.
+    /// The number of validation rows whose [`Recording::row_id`] is among the sorted `rows`, and the number of all validation rows.
     pub fn validation_rows_among(&self, rows: &[u64]) -> (usize, usize) {
         let mut ids: Vec<u64> = self.split.validation.iter().map(|item| self.row_id(item)).collect();
         ids.sort_unstable();

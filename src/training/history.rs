@@ -1,11 +1,10 @@
-//! What each epoch brought.
+//! The history of a run: one record for each epoch.
 
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
 use crate::error::{Error, Result};
-use crate::files::atomic_file;
 
 /// One line of `history.csv`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -25,24 +24,19 @@ pub struct EpochRecord {
     pub relative_to_zero: Option<f64>,
     /// Learning rate of the last update.
     pub learning_rate: f64,
-    /// Training images.
+    /// Number of training images.
     pub images: usize,
-    /// Time the training batches took, without validation.
+    /// Time of the training batches without validation, seconds.
     pub train_seconds: f64,
-    /// Time of the whole epoch.
+    /// Time of the whole epoch, seconds.
     pub seconds: f64,
 }
 
-/// Writes `history` as CSV, in whole or not at all.
+/// `history` as the CSV of the file `path`.
 ///
 /// # Errors
 ///
-/// [`Error::Io`].
-pub fn write_history(path: &Path, history: &[EpochRecord]) -> Result<()> {
-    atomic_file::write(path, &history_csv(path, history)?)
-}
-
-/// `history` as the CSV of the file `path`.
+/// [`Error::Data`] for values that CSV cannot hold.
 pub(super) fn history_csv(path: &Path, history: &[EpochRecord]) -> Result<Vec<u8>> {
     let mut writer = csv::Writer::from_writer(Vec::new());
     for record in history {
@@ -51,7 +45,7 @@ pub(super) fn history_csv(path: &Path, history: &[EpochRecord]) -> Result<Vec<u8
     writer.into_inner().map_err(|e| Error::data(path, e.to_string()))
 }
 
-/// Reads what [`write_history`] wrote.
+/// Reads what [`history_csv`] made.
 ///
 /// # Errors
 ///
@@ -87,7 +81,7 @@ mod tests {
             seconds: 2.0,
         };
         let history = [record, EpochRecord { epoch: 2, ..record }];
-        write_history(&path, &history).unwrap();
+        std::fs::write(&path, history_csv(&path, &history).unwrap()).unwrap();
         assert_eq!(read_history(&path).unwrap(), history);
         std::fs::write(&path, std::fs::read_to_string(&path).unwrap().replace("\n2,", "\nx,")).unwrap();
         assert!(read_history(&path).unwrap_err().to_string().contains("history.csv:3:"));

@@ -1,4 +1,4 @@
-//! Where the time of a run goes.
+//! The time of a run, split by activity.
 
 use std::time::{Duration, Instant};
 
@@ -13,7 +13,7 @@ use crate::engine::stopwatch::Stopwatch;
 #[derive(Debug)]
 pub(super) struct Profile {
     started: Instant,
-    /// CPU time of the process at the start, where the system tells.
+    /// CPU time of the process at the start, where the system provides it.
     cpu_started: Option<ProcessTime>,
     pub loading: LoaderTimes,
     /// Adding the shards' gradients up, and the optimizer.
@@ -22,8 +22,8 @@ pub(super) struct Profile {
     pub waiting: Stopwatch,
 }
 
-/// Where the time of a run went, since the process began with it. Seconds of work are CPU time of the threads, summed: on two
-/// threads that are never idle they grow by two a second.
+/// The time of a run since this process began it, split by activity. Times of work are CPU seconds summed over the threads: two
+/// busy threads add two seconds in each second.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ProfileReport {
@@ -48,9 +48,9 @@ pub struct ProfileReport {
     /// The rest of `threads` times `wall_s`: reading logs, writing models, waiting for the disk or for
     /// other programs, and threads that were idle.
     pub other_s: f64,
-    /// Wall time in which the network was done with a batch and the next one was not ready.
+    /// Wall time that the network waited for its next batch.
     pub waiting_for_data_s: f64,
-    /// CPU time of the process; absent where the system does not tell.
+    /// CPU time of the process; absent where the system does not provide it.
     pub cpu_s: Option<f64>,
     /// `cpu_s` as a share of `threads` times `wall_s`, in percent.
     pub busy_percent: Option<f64>,

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use steersman_kernels::conv::ConvAlgorithm;
 
 use super::history::{EpochRecord, history_csv, read_history};
-use super::session::TrainResult;
+use super::run::TrainResult;
 use crate::error::{Error, Result};
 use crate::files::lock::{LOCK_NAME, Lock};
 use crate::files::{checksums, unfinished};
@@ -16,20 +16,20 @@ use crate::recipe::Recipe;
 
 /// The folder of a run, and the names of what is in it.
 #[derive(Clone, Debug)]
-pub struct RunFolder {
+pub(crate) struct RunFolder {
     path: PathBuf,
 }
 
 /// The lock of a run folder. It ends with its process, however that ends.
 #[derive(Debug)]
-pub struct RunLock {
+pub(crate) struct RunLock {
     _lock: Lock,
 }
 
-/// What `run.json` says.
+/// The content of `run.json`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct RunInfo {
+pub(crate) struct RunInfo {
     /// Version of the program that began the run.
     pub version: String,
     /// Vector code it ran on.
@@ -205,7 +205,7 @@ impl RunFolder {
         read_history(&self.file("history.csv"))
     }
 
-    /// What the run came to; `None` while it is not finished.
+    /// The result of the run; `None` while it is not finished.
     ///
     /// # Errors
     ///

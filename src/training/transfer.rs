@@ -1,4 +1,4 @@
-//! Beginning with the weights of a model instead of fresh ones.
+//! Transfer: a run that starts from the weights of a model.
 
 use std::path::{Path, PathBuf};
 
@@ -10,7 +10,7 @@ use crate::error::{Error, Result};
 use crate::model_file::{Model, Transfer};
 use crate::recipe::Recipe;
 
-/// Which model to begin from, and what of it stays as it is.
+/// The model to start from, and the layers to freeze.
 #[derive(Clone, Debug)]
 pub struct TransferRequest {
     /// The model file.
@@ -26,12 +26,12 @@ impl TransferRequest {
     }
 }
 
-/// Where a run begins that does not begin afresh.
+/// The start of a run with transferred weights.
 #[derive(Debug)]
 pub(super) struct Start {
     pub transfer: Transfer,
     pub parameters: Parameters,
-    /// The rows that the model has seen in training, sorted.
+    /// The rows that the model was trained on, sorted.
     pub rows: Vec<u64>,
     /// Held-out tracks that the model was trained on.
     pub trained_on_held_out: Vec<String>,
@@ -80,7 +80,7 @@ impl Start {
         Ok(Start { transfer, parameters, rows: model.training_rows, trained_on_held_out, recipe: model.recipe })
     }
 
-    /// What the user should know.
+    /// Messages for the user.
     pub fn notices(&self, recipe: &Recipe, data: &Data) -> Vec<String> {
         let Transfer { model, taken, fresh, frozen } = &self.transfer;
         let list = |names: &[String]| if names.is_empty() { "none".into() } else { names.join(", ") };

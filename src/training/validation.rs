@@ -1,5 +1,8 @@
-//! The held-out side, after each epoch.
+//! Evaluation on the validation side after each epoch.
 
+use ndarray::ArrayViewMut1;
+
+use super::data;
 use crate::dataset::View;
 use crate::dataset::leak::NearTwins;
 use crate::dataset::loader::{Batch, Loader, LoaderTimes};
@@ -7,9 +10,9 @@ use crate::engine::network::{InferencePlan, Network, Parameters};
 use crate::engine::stopwatch::Stopwatch;
 use crate::error::Result;
 
-/// How the network does on the validation side.
+/// Errors of the network on the validation side.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct ValidationResult {
+pub(super) struct ValidationResult {
     /// Mean squared error over all validation images.
     pub mse: f64,
     /// Mean squared error over the images of the centre camera, not mirrored; the fields below are of the same images.
@@ -22,7 +25,7 @@ pub struct ValidationResult {
 
 /// The validation side with its buffers.
 #[derive(Debug)]
-pub struct Validation {
+pub(super) struct Validation {
     loader: Loader,
     plan: InferencePlan,
     batches: [Batch; 2],
@@ -42,7 +45,7 @@ impl Validation {
         }
     }
 
-    /// Adds the time that is spent from now on to `loading` and `evaluation`.
+    /// Measures from now on: adds the times to `loading` and `evaluation`.
     pub fn measure(&mut self, loading: &LoaderTimes, evaluation: Stopwatch) {
         self.loader.measure(loading);
         self.plan.measure(evaluation);
@@ -58,7 +61,7 @@ impl Validation {
         self.loader.undecodable()
     }
 
-    /// How many validation frames look almost like one of `training`, among those decoded so far.
+    /// The validation frames that are nearly identical to one of `training`, among those decoded so far.
     pub fn near_twins(&self, training: &Loader) -> NearTwins {
         self.loader.near_twins(training)
     }
@@ -74,10 +77,17 @@ impl Validation {
         let (mut center_squares, mut center_absolute, mut label_squares, mut center_images) = (0.0, 0.0, 0.0, 0usize);
         loader.fill(0, current)?;
         for batch in 0..loader.batches() {
-            // While the network looks at one batch, the next one is prepared.
+            // The next batch is loaded while the network evaluates this one.
             let predictions = &mut predictions[..current.n];
             let ((), filled) = rayon::join(
-                || plan.run(network, parameters, &current.x, predictions),
+                || {
+                    plan.run(
+                        network,
+                        parameters,
+                        data::images(network.input(), current),
+                        ArrayViewMut1::from(&mut *predictions),
+                    )
+                },
                 || if batch + 1 < loader.batches() { loader.fill(batch + 1, next) } else { Ok(()) },
             );
             filled?;

@@ -116,7 +116,7 @@ impl ImageCache {
                 }
                 if let Some(file) = &self.file {
                     file.write(buffer, offset)?;
-                    self.checksums[i].store(crc32fast::hash(buffer), Ordering::Relaxed);
+                    self.checksums[i].store(checksum(buffer), Ordering::Relaxed);
                     state.store(IN_FILE, Ordering::Release);
                 }
                 return Ok(Some(buffer));
@@ -127,7 +127,7 @@ impl ImageCache {
             (Some(file), IN_FILE) => {
                 file.read(buffer, offset)?;
                 // What the disk has damaged is made again.
-                if crc32fast::hash(buffer) != self.checksums[i].load(Ordering::Relaxed) && !make(buffer) {
+                if checksum(buffer) != self.checksums[i].load(Ordering::Relaxed) && !make(buffer) {
                     return Ok(None);
                 }
                 Ok(Some(buffer))
@@ -135,6 +135,13 @@ impl ImageCache {
             _ => Ok(None),
         }
     }
+}
+
+/// CRC-32 of an image.
+fn checksum(image: &[u8]) -> u32 {
+    let mut crc = flate2::Crc::new();
+    crc.update(image);
+    crc.sum()
 }
 
 /// The temporary file. It has no name (or is deleted when it is closed), so a run that is killed leaves nothing behind.

@@ -45,7 +45,7 @@ impl BatchNorm {
     }
 
     /// The parts of what the barrier has found out.
-    pub(super) fn split<'a>(&self, moments: &'a [f32]) -> Moments<'a> {
+    pub(crate) fn split<'a>(&self, moments: &'a [f32]) -> Moments<'a> {
         let mut parts = moments.chunks_exact(self.shape.c);
         let mut next = || parts.next().expect("moments have 7 values a channel");
         Moments {
@@ -62,7 +62,7 @@ impl BatchNorm {
 
 impl BatchNorm {
     /// Evaluation's `y = x · scale + shift`, from the running statistics; `scratch` has at least 2 c numbers.
-    pub(super) fn scale_and_shift<'a>(
+    pub(crate) fn scale_and_shift<'a>(
         &self,
         params: &[f32],
         statistics: &[f32],
@@ -80,7 +80,7 @@ impl BatchNorm {
     }
 
     /// Adds the gradients of gamma and beta that follow from the sums of the backward pass.
-    pub(super) fn add_gradients(&self, sums: &[f64], dparams: &mut [f32]) {
+    pub(crate) fn add_gradients(&self, sums: &[f64], dparams: &mut [f32]) {
         let c = self.shape.c;
         let (dgamma, dbeta) = dparams.split_at_mut(c);
         for i in 0..c {
@@ -92,7 +92,7 @@ impl BatchNorm {
 
 /// What the whole batch says of each channel; every slice has `[c]` numbers.
 #[derive(Clone, Copy)]
-pub(super) struct Moments<'a> {
+pub(crate) struct Moments<'a> {
     pub mean: &'a [f32],
     pub inv_std: &'a [f32],
     /// `y = x · scale + shift`.

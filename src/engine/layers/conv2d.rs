@@ -95,12 +95,12 @@ impl Conv2d {
     }
 
     /// The kernel that computes it.
-    pub(super) fn kernel(&self) -> &Conv {
+    pub(crate) fn kernel(&self) -> &Conv {
         &self.conv
     }
 
     /// Weight and bias.
-    pub(super) fn split<'a>(&self, params: &'a [f32]) -> (&'a [f32], &'a [f32]) {
+    pub(crate) fn split<'a>(&self, params: &'a [f32]) -> (&'a [f32], &'a [f32]) {
         params.split_at(self.weight_len())
     }
 

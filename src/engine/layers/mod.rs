@@ -42,9 +42,7 @@ mod formula;
 pub mod gradcheck;
 mod kind;
 mod kind_check;
-mod norm_rectify;
 mod pool;
-mod pooled_conv;
 mod scale;
 mod zero_pad;
 
@@ -54,6 +52,7 @@ pub use activation::{
     Elu, EluSpec, LeakyRelu, LeakyReluSpec, PRelu, PReluSpec, Relu, ReluSpec, Slopes, Softsign, SoftsignSpec, Swish,
     SwishSpec, Tanh, TanhSpec,
 };
+pub(crate) use batch_norm::Moments;
 pub use batch_norm::{BatchNorm, BatchNormSpec};
 pub use conv2d::{Conv2d, Conv2dSpec, Padding};
 pub use crop::{Crop, CropSpec};
@@ -64,9 +63,7 @@ pub use flatten::{Flatten, FlattenSpec};
 pub use formula::{Formula, Function};
 pub use kind::{Family, LayerKind, ReceptiveField};
 pub use kind_check::check_kind;
-pub use norm_rectify::NormRectify;
 pub use pool::{AveragePool, AveragePoolSpec, MaxPool, MaxPoolSpec};
-pub use pooled_conv::{PooledConv, Rising};
 pub use scale::{Scale, ScaleSpec};
 pub use zero_pad::{ZeroPad, ZeroPadSpec};
 

@@ -2,10 +2,11 @@
 
 use std::ops::Range;
 
-use ndarray::{Array2, ArrayView4};
+use ndarray::{Array2, ArrayView4, ArrayViewMut1};
 use rayon::prelude::*;
 
-use super::stages::{Kind, Stage, stages};
+use super::fused::{FusedStage, Kind, stages};
+use super::step_input::image_slice;
 use super::{Network, Parameters};
 use crate::engine::layers::{Family, Packing};
 use crate::engine::stopwatch::Stopwatch;
@@ -21,14 +22,15 @@ const GROUP: usize = 8;
 /// group of images, so that the weights are read once for all of them.
 #[derive(Clone, Debug)]
 pub struct InferencePlan {
-    stages: Vec<Stage>,
-    /// How many stages there are before the first dense layer.
+    stages: Vec<FusedStage>,
+    /// Number of stages before the first dense layer.
     maps: usize,
-    /// What [`prepare`](InferencePlan::prepare) made of the parameters of each stage; empty where there is nothing to.
-    prepared: Vec<Vec<f32>>,
-    is_prepared: bool,
+    /// The packed weights of each stage; empty for stages without any.
+    packed: Vec<Vec<f32>>,
     workers: Vec<Worker>,
     capacity: usize,
+    /// [`Network::fingerprint`] of the network it was planned for.
+    fingerprint: u64,
     /// Gets the time of all workers.
     time: Stopwatch,
 }
@@ -37,7 +39,7 @@ pub struct InferencePlan {
 struct Worker {
     /// Input and output of a stage for one image.
     image: [Vec<f32>; 2],
-    /// What goes into the first dense layer.
+    /// Input of the first dense layer.
     rows: Vec<f32>,
     /// Input and output of a stage for a group.
     group: [Vec<f32>; 2],
@@ -50,9 +52,9 @@ impl InferencePlan {
     pub fn new(network: &Network, capacity: usize) -> InferencePlan {
         let group = capacity.clamp(1, GROUP);
         let stages = stages(network);
-        let is_dense = |stage: &Stage| network.layers()[stage.layers.start].spec.family() == Family::Dense;
+        let is_dense = |stage: &FusedStage| network.layers()[stage.layers.start].spec.family() == Family::Dense;
         let maps = stages.iter().position(is_dense).unwrap_or(stages.len());
-        let largest = |stages: &[Stage]| stages.iter().map(|stage| stage.output_len(network)).max().unwrap_or(0);
+        let largest = |stages: &[FusedStage]| stages.iter().map(|stage| stage.output_len(network)).max().unwrap_or(0);
         let between = stages[..maps].last().map_or(0, |stage| stage.output_len(network));
         let (image, after) = (largest(&stages[..maps]), group * largest(&stages[maps..]));
         let scratch = stages.iter().map(|stage| stage.scratch_len(network, group)).max().unwrap_or(0);
@@ -62,14 +64,14 @@ impl InferencePlan {
             group: [vec![0.0; after], vec![0.0; after]],
             scratch: vec![0.0; scratch],
         };
-        let prepared_len = |stage: &Stage| stage.packing(network).map_or(0, |packing| packing.packed_len());
+        let packed_len = |stage: &FusedStage| stage.packing(network).map_or(0, |packing| packing.packed_len());
         InferencePlan {
-            prepared: stages.iter().map(|stage| vec![0.0; prepared_len(stage)]).collect(),
-            is_prepared: false,
+            packed: stages.iter().map(|stage| vec![0.0; packed_len(stage)]).collect(),
             workers: (0..capacity.div_ceil(group)).map(|_| worker()).collect(),
             stages,
             maps,
             capacity,
+            fingerprint: network.fingerprint(),
             time: Stopwatch::default(),
         }
     }
@@ -79,65 +81,70 @@ impl InferencePlan {
         self.time = time;
     }
 
-    /// Runs the network on `x`, `[n][c][h][w]`, and fills `y`, `[n][outputs]`. An image's output does not depend on the
-    /// others.
+    /// Runs the network on `x`, `(n, c, h, w)`, and fills `y`, `(n · outputs)`, image by image. An image's output does not
+    /// depend on the others. Packs the weights first: for parameters that stay the same, a [`Predictor`](super::Predictor) does
+    /// so once. Allocates nothing.
     ///
     /// # Panics
     ///
-    /// Panics if the batch is larger than planned or the lengths do not fit the network.
-    pub fn run(&mut self, network: &Network, parameters: &Parameters, x: &[f32], y: &mut [f32]) {
-        self.prepare(network, parameters);
-        self.run_prepared(network, parameters, x, y);
+    /// Panics if `network` differs from the one the plan was made for, if `parameters` are not those of such a network, or if
+    /// the batch is larger than planned, of the wrong shape or not in standard order.
+    pub fn run(&mut self, network: &Network, parameters: &Parameters, x: ArrayView4<f32>, y: ArrayViewMut1<f32>) {
+        self.pack(network, parameters);
+        self.run_packed(network, parameters, x, y);
     }
 
-    /// Puts the parameters in the order in which they are read: once, before many calls of
-    /// [`run_prepared`](InferencePlan::run_prepared) with few images each.
-    pub fn prepare(&mut self, network: &Network, parameters: &Parameters) {
-        for (stage, to) in self.stages.iter().zip(&mut self.prepared) {
+    /// Packs the weights of `parameters`.
+    pub(super) fn pack(&mut self, network: &Network, parameters: &Parameters) {
+        assert_eq!(self.fingerprint, network.fingerprint(), "an inference plan for another network");
+        network.check_parameters(parameters);
+        for (stage, to) in self.stages.iter().zip(&mut self.packed) {
             if let Some(packing) = stage.packing(network) {
                 packing.pack(&parameters.values[stage.params(network)], to);
             }
         }
-        self.is_prepared = true;
     }
 
-    /// As [`run`](InferencePlan::run), with the parameters that [`prepare`](InferencePlan::prepare) has last been given.
-    ///
-    /// # Panics
-    ///
-    /// As [`run`](InferencePlan::run), and if [`prepare`](InferencePlan::prepare) has not been called: all weights would be 0.
-    pub fn run_prepared(&mut self, network: &Network, parameters: &Parameters, x: &[f32], y: &mut [f32]) {
-        assert!(self.is_prepared, "run_prepared before prepare");
+    /// [`run`](InferencePlan::run) with the weights that are packed already: those of `parameters`, for which the caller answers.
+    pub(super) fn run_packed(
+        &mut self,
+        network: &Network,
+        parameters: &Parameters,
+        x: ArrayView4<f32>,
+        mut y: ArrayViewMut1<f32>,
+    ) {
         let (input, output) = (network.input().len(), network.output().len());
+        let x = image_slice(network, x);
         let n = x.len() / input;
         assert!(n <= self.capacity, "a batch of {n} images in a plan for {}", self.capacity);
-        assert_eq!((x.len(), y.len()), (n * input, n * output));
-        let InferencePlan { stages, maps, prepared, workers, time, .. } = self;
-        let run = Run { network, parameters, stages, maps: *maps, prepared };
+        let y = y.as_slice_mut().expect("predictions must be contiguous");
+        assert_eq!(y.len(), n * output, "predictions of a batch of {n} images");
+        let InferencePlan { stages, maps, packed, workers, time, .. } = self;
+        let context = InferenceContext { network, parameters, stages, maps: *maps, packed };
         if n <= GROUP {
             for ((x, y), worker) in x.chunks(GROUP * input).zip(y.chunks_mut(GROUP * output)).zip(workers) {
-                time.time(|| run.group(worker, x, y));
+                time.time(|| context.group(worker, x, y));
             }
         } else {
             x.par_chunks(GROUP * input)
                 .zip(y.par_chunks_mut(GROUP * output))
                 .zip(workers)
-                .for_each(|((x, y), worker)| time.time(|| run.group(worker, x, y)));
+                .for_each(|((x, y), worker)| time.time(|| context.group(worker, x, y)));
         }
     }
 }
 
-/// What all workers share.
+/// What all workers of an evaluation share.
 #[derive(Clone, Copy)]
-struct Run<'a> {
+struct InferenceContext<'a> {
     network: &'a Network,
     parameters: &'a Parameters,
-    stages: &'a [Stage],
+    stages: &'a [FusedStage],
     maps: usize,
-    prepared: &'a [Vec<f32>],
+    packed: &'a [Vec<f32>],
 }
 
-impl Run<'_> {
+impl InferenceContext<'_> {
     fn group(&self, worker: &mut Worker, x: &[f32], y: &mut [f32]) {
         let Worker { image, rows, group, scratch } = worker;
         let input = self.network.input().len();
@@ -182,17 +189,17 @@ impl Run<'_> {
         let statistics = &self.parameters.statistics[first.statistics.clone()];
         match &stage.kind {
             Kind::Layer => match first.layer.packing() {
-                Some(layer) => layer.infer_packed(&self.prepared[index], n, x, y, scratch),
+                Some(layer) => layer.infer_packed(&self.packed[index], n, x, y, scratch),
                 None => first.layer.infer(params, statistics, n, x, y, scratch),
             },
             Kind::NormRectify(fused) => fused.infer(params, statistics, n, x, y, scratch),
-            Kind::PooledConv(fused) => fused.infer_packed(&self.prepared[index], n, x, y, scratch),
+            Kind::PooledConv(fused) => fused.infer_packed(&self.packed[index], n, x, y, scratch),
         }
     }
 }
 
 impl Network {
-    /// Runs the network on images `[n, c, h, w]`; the result is `[n, outputs]`. Plans its buffers anew: for one-off use.
+    /// The outputs, `(n, outputs)`, of `images`, `(n, c, h, w)` in any memory layout. Plans its buffers anew: for a single call.
     ///
     /// # Errors
     ///
@@ -207,19 +214,18 @@ impl Network {
             )));
         }
         let x = images.as_standard_layout();
-        let x = x.as_slice().expect("standard layout is contiguous");
         let mut y = Array2::zeros((n, self.output().len()));
-        let y_slice = y.as_slice_mut().expect("a fresh array is contiguous");
-        InferencePlan::new(self, n).run(self, parameters, x, y_slice);
+        let flat = y.view_mut().into_shape_with_order(n * self.output().len()).expect("a fresh array is contiguous");
+        InferencePlan::new(self, n).run(self, parameters, x.view(), flat);
         Ok(y)
     }
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod testing {
     use steersman_kernels::Isa;
 
-    use super::super::{LayerSpec, NamedLayer};
+    use super::super::LayerSpec;
     use super::*;
 
     #[derive(serde::Deserialize)]
@@ -227,23 +233,47 @@ mod tests {
         layers: Vec<LayerSpec>,
     }
 
-    fn network(layers: &str, isa: Isa) -> Network {
+    /// A network of `layers`, as in a recipe, over images of 2 channels, 21 rows and 19 columns.
+    pub fn network(layers: &str, isa: Isa) -> Network {
         let specs = toml::from_str::<Layers>(&format!("layers = [{layers}]")).unwrap().layers;
         Network::new(Shape::new(2, 21, 19), &specs, isa).unwrap()
     }
+}
 
+#[cfg(test)]
+mod tests {
+    use ndarray::{Array1, Array4};
+    use steersman_kernels::Isa;
+
+    use super::super::{NamedLayer, Predictor};
+    use super::testing::network;
+    use super::*;
+
+    /// A convolution and an activation fill the same buffers with other options: only the fingerprint tells them apart.
     #[test]
-    #[should_panic(expected = "run_prepared before prepare")]
-    fn a_plan_without_weights_does_not_run() {
-        let network = network("{ kind = 'dense', units = 1 }", Isa::PORTABLE);
-        let parameters = network.initialize(1);
-        let x = vec![0.0; network.input().len()];
-        InferencePlan::new(&network, 1).run_prepared(&network, &parameters, &x, &mut [0.0]);
+    #[should_panic(expected = "an inference plan for another network")]
+    fn a_plan_refuses_another_network_of_the_same_sizes() {
+        let layers = |alpha: f32| format!("{{ kind = 'elu', alpha = {alpha:?} }}, {{ kind = 'dense', units = 1 }}");
+        let (planned, other) = (network(&layers(1.0), Isa::PORTABLE), network(&layers(0.5), Isa::PORTABLE));
+        let x = Array4::zeros(other.input().batch(1));
+        let mut y = Array1::zeros(1);
+        InferencePlan::new(&planned, 1).run(&other, &other.initialize(1), x.view(), y.view_mut());
     }
 
-    /// Convolution, activation and pooling as one, with weights that are prepared once: the bits of layer by layer.
     #[test]
-    fn prepared_weights_of_a_pooled_convolution_change_no_bit() {
+    fn images_in_another_memory_order_are_predicted_alike() {
+        let network = network("{ kind = 'relu' }, { kind = 'dense', units = 1 }", Isa::PORTABLE);
+        let parameters = network.initialize(1);
+        let x = Array4::from_shape_fn(network.input().batch(2), |(n, c, h, w)| (n + 2 * c + 3 * h + 5 * w) as f32);
+        let columns_first = x.view().reversed_axes().as_standard_layout().into_owned();
+        let same = columns_first.view().reversed_axes();
+        assert!(!same.is_standard_layout());
+        assert_eq!(network.predict(&parameters, same).unwrap(), network.predict(&parameters, x.view()).unwrap());
+    }
+
+    /// Convolution, activation and pooling as one, with weights that are packed once: the bits of layer by layer.
+    #[test]
+    fn packed_weights_of_a_pooled_convolution_change_no_bit() {
         let conv = "{ kind = 'conv2d', filters = 5, kernel = [3, 3] }";
         for activation in ["relu", "elu"] {
             let layers = format!(
@@ -252,14 +282,14 @@ mod tests {
             for isa in Isa::available() {
                 let network = network(&layers, isa);
                 let parameters = network.initialize(2);
-                let mut plan = InferencePlan::new(&network, 3);
-                assert!(matches!(plan.stages[0].kind, Kind::PooledConv(_)));
-                plan.prepare(&network, &parameters);
+                assert!(matches!(stages(&network)[0].kind, Kind::PooledConv(_)));
+                let mut predictor = Predictor::new(super::testing::network(&layers, isa), parameters.clone(), 3);
                 let len = network.input().len();
                 for seed in 0..3 {
                     let x: Vec<f32> = (0..3 * len).map(|i| ((i * 37 + seed * 11) % 101) as f32 / 50.0 - 1.0).collect();
-                    let mut y = [0.0; 3];
-                    plan.run_prepared(&network, &parameters, &x, &mut y);
+                    let mut y = Array1::zeros(3);
+                    let images = ArrayView4::from_shape(network.input().batch(3), &x).unwrap();
+                    predictor.run(images, y.view_mut());
                     for (x, y) in x.chunks_exact(len).zip(y) {
                         let mut maps = x.to_vec();
                         for NamedLayer { layer, params, .. } in network.layers() {

@@ -1,308 +1,36 @@
-//! A network: named layers in order, and where their numbers lie.
+//! Networks and the plans that run them.
 //!
-//! [`Network`] is the description, [`Parameters`] the numbers; [`TrainingPlan`] and [`InferencePlan`] own the buffers of a
-//! pass. A plan borrows the parameters for the length of a call: shared to infer, so evaluation cannot change them.
+//! | | |
+//! |---|---|
+//! | [`Network`] | the description: named layers in order, and the layout of their tensors |
+//! | [`Parameters`] | the numbers |
+//! | [`TrainingPlan`] | the buffers of a training step: forward, loss, backward |
+//! | [`InferencePlan`] | the buffers of evaluation, for parameters that change between calls |
+//! | [`ObservationPlan`] | the buffers of evaluation layer by layer, to look at each output |
+//! | [`Predictor`] | evaluation with parameters that stay: it owns them, and packs their weights once |
+//!
+//! A plan borrows the parameters for the length of a call: shared for evaluation, which therefore cannot change them.
+//! A plan refuses another network than the one it was planned for.
 
+mod fused;
 mod inference;
 mod observation;
 mod passes;
+mod predictor;
 mod shard;
 mod spec;
-mod stages;
+mod step_input;
 mod step_profile;
+mod structure;
 mod training;
-
-use std::fmt::Write as _;
-use std::ops::Range;
 
 pub use inference::InferencePlan;
 pub use observation::ObservationPlan;
+pub use predictor::Predictor;
 pub use spec::LayerSpec;
-use steersman_kernels::{Backend, Isa};
+pub use step_input::StepInput;
 pub use step_profile::StageTime;
-pub(crate) use training::CHUNK;
-pub use training::{StepInput, TrainingPlan};
+pub use structure::{MAX_PARAMETERS, NamedLayer, Network, group_digits};
+pub use training::TrainingPlan;
 
-use crate::engine::layers::{Layer, ParamSpec};
-use crate::engine::random::{Purpose, rng};
-use crate::engine::tensor::Shape;
-use crate::error::{Error, Result};
-use crate::recipe::did_you_mean;
-
-/// Layers in order, each knowing its input shape.
-#[derive(Debug)]
-pub struct Network {
-    input: Shape,
-    layers: Vec<NamedLayer>,
-    tensors: Vec<Tensor>,
-    backend: Backend,
-}
-
-/// A layer and where its tensors lie in [`Parameters`].
-#[derive(Debug)]
-pub struct NamedLayer {
-    /// Name, unique in the network.
-    pub name: String,
-    /// The entry of the recipe.
-    pub spec: LayerSpec,
-    /// The layer itself.
-    pub layer: Box<dyn Layer>,
-    /// Where its parameters lie in [`Parameters::values`].
-    pub params: Range<usize>,
-    /// Where its running statistics lie in [`Parameters::statistics`].
-    pub statistics: Range<usize>,
-    /// Whether training leaves its parameters and statistics as they are.
-    pub frozen: bool,
-}
-
-/// One named tensor of a network.
-#[derive(Clone, Debug)]
-pub struct Tensor {
-    /// `layer.tensor`, as in `conv1.weight`.
-    pub name: String,
-    /// Shape, first values, decay.
-    pub spec: ParamSpec,
-    /// Whether the optimizer changes it; running statistics are not trainable.
-    pub trainable: bool,
-    /// Where it lies: in [`Parameters::values`] if trainable, else in [`Parameters::statistics`].
-    pub range: Range<usize>,
-    /// Whether training leaves it as it is, because its layer is frozen.
-    pub frozen: bool,
-}
-
-/// The numbers of a network.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Parameters {
-    /// All trainable tensors, one after the other.
-    pub values: Vec<f32>,
-    /// All running statistics, one after the other.
-    pub statistics: Vec<f32>,
-}
-
-impl Parameters {
-    /// The numbers of `tensor`.
-    pub fn tensor(&self, tensor: &Tensor) -> &[f32] {
-        let arena = if tensor.trainable { &self.values } else { &self.statistics };
-        &arena[tensor.range.clone()]
-    }
-
-    /// The numbers of `tensor`, to be changed.
-    pub fn tensor_mut(&mut self, tensor: &Tensor) -> &mut [f32] {
-        let arena = if tensor.trainable { &mut self.values } else { &mut self.statistics };
-        &mut arena[tensor.range.clone()]
-    }
-}
-
-/// Most parameters of a network: 400 MB of them, and several times that in training. A recipe or a model file cannot ask for
-/// more memory than the machine has by a slip.
-pub const MAX_PARAMETERS: usize = 100_000_000;
-
-impl Network {
-    /// The network of `specs` over images of `input`, computed with `backend`: an [`Isa`], or one with a convolution algorithm.
-    ///
-    /// # Errors
-    ///
-    /// [`Error::Network`] names the first layer that does not fit and says why.
-    pub fn new(input: Shape, specs: &[LayerSpec], backend: impl Into<Backend>) -> Result<Network> {
-        let backend = backend.into();
-        let mut network = Network { input, layers: Vec::new(), tensors: Vec::new(), backend };
-        let (mut params_end, mut statistics_end) = (0, 0);
-        for (index, spec) in specs.iter().enumerate() {
-            let same_kind = specs[..index].iter().filter(|other| other.base_name() == spec.base_name()).count();
-            let name = format!("{}{}", spec.base_name(), same_kind + 1);
-            let layer = spec
-                .build(network.output(), backend)
-                .map_err(|message| Error::Network { layer: name.clone(), message })?;
-            let (params_start, statistics_start) = (params_end, statistics_end);
-            for (specs, end, trainable) in
-                [(layer.params(), &mut params_end, true), (layer.statistics(), &mut statistics_end, false)]
-            {
-                for spec in specs {
-                    let message = || {
-                        format!("the network has more than {MAX_PARAMETERS} parameters; take fewer units or channels")
-                    };
-                    let len = spec.shape.iter().try_fold(1usize, |len, n| len.checked_mul(*n));
-                    let Some(len) = len.filter(|len| *len <= MAX_PARAMETERS - *end) else {
-                        return Err(Error::Network { layer: name.clone(), message: message() });
-                    };
-                    let range = *end..*end + len;
-                    *end = range.end;
-                    let name = format!("{name}.{}", spec.name);
-                    network.tensors.push(Tensor { name, spec, trainable, range, frozen: false });
-                }
-            }
-            network.layers.push(NamedLayer {
-                name,
-                spec: spec.clone(),
-                layer,
-                params: params_start..params_end,
-                statistics: statistics_start..statistics_end,
-                frozen: false,
-            });
-        }
-        if network.layers.is_empty() {
-            return Err(Error::Network {
-                layer: "(none)".into(),
-                message: "a network needs at least one layer".into(),
-            });
-        }
-        Ok(network)
-    }
-
-    /// Shape of one input image.
-    pub fn input(&self) -> Shape {
-        self.input
-    }
-
-    /// Shape of one output.
-    pub fn output(&self) -> Shape {
-        self.layers.last().map_or(self.input, |last| last.layer.output())
-    }
-
-    /// The layers in order.
-    pub fn layers(&self) -> &[NamedLayer] {
-        &self.layers
-    }
-
-    /// All tensors in their fixed order: layer by layer, parameters before statistics.
-    pub fn tensors(&self) -> &[Tensor] {
-        &self.tensors
-    }
-
-    /// The vector code the network runs on.
-    pub fn isa(&self) -> Isa {
-        self.backend.isa
-    }
-
-    /// What the network is computed with.
-    pub fn backend(&self) -> Backend {
-        self.backend
-    }
-
-    /// Freezes the layers called `names`: training leaves their parameters and running statistics as they are, and batch
-    /// normalisation computes with its running statistics in training too.
-    ///
-    /// # Errors
-    ///
-    /// [`Error::Usage`] if there is no such layer, it has no parameters, or nothing would be left to train.
-    pub fn freeze(&mut self, names: &[String]) -> Result<()> {
-        let with_parameters = |layer: &&NamedLayer| !layer.params.is_empty();
-        for name in names {
-            let Some(layer) = self.layers.iter_mut().find(|layer| layer.name == *name) else {
-                let known: Vec<&str> =
-                    self.layers.iter().filter(with_parameters).map(|layer| layer.name.as_str()).collect();
-                let hint = did_you_mean(name, &known);
-                let known = known.join(", ");
-                return Err(Error::Usage(format!(
-                    "there is no layer `{name}` to freeze{hint}; with weights are {known}"
-                )));
-            };
-            if layer.params.is_empty() {
-                return Err(Error::Usage(format!("layer `{name}` has no weights that could be frozen")));
-            }
-            layer.frozen = true;
-            let of_layer = |tensor: &&mut Tensor| tensor.name.split_once('.').is_some_and(|(layer, _)| layer == name);
-            self.tensors.iter_mut().filter(of_layer).for_each(|tensor| tensor.frozen = true);
-        }
-        if self.layers.iter().filter(with_parameters).all(|layer| layer.frozen) {
-            return Err(Error::Usage("every layer with weights is frozen; nothing is left to train".into()));
-        }
-        Ok(())
-    }
-
-    /// Freshly drawn parameters. Each tensor has a random stream of its own, so the draw of one does not depend on the
-    /// others.
-    pub fn initialize(&self, seed: u64) -> Parameters {
-        let mut parameters =
-            Parameters { values: vec![0.0; self.count(true)], statistics: vec![0.0; self.count(false)] };
-        for (index, tensor) in self.tensors.iter().enumerate() {
-            let mut random = rng(seed, Purpose::Initialise, 0, index as u64);
-            tensor.spec.init.fill(tensor.spec.fans, &mut random, parameters.tensor_mut(tensor));
-        }
-        parameters
-    }
-
-    /// How many numbers are trainable, or are not.
-    pub fn count(&self, trainable: bool) -> usize {
-        self.tensors.iter().filter(|t| t.trainable == trainable).map(|t| t.range.len()).sum()
-    }
-
-    /// Multiply-adds of one image's forward pass.
-    pub fn multiply_adds(&self) -> u64 {
-        self.layers.iter().map(|l| l.layer.multiply_adds()).sum()
-    }
-
-    /// The layer table: name, kind, output shape (height x width x channels), parameters, multiply-adds; then the totals.
-    pub fn summary(&self) -> String {
-        let rule = "-".repeat(76);
-        let mut text = String::new();
-        // Writing to a String cannot fail.
-        let _ = writeln!(text, "{:<10} {:<24} {:<14} {:>10} {:>14}", "layer", "kind", "output", "params", "mult-adds");
-        let _ = writeln!(text, "{rule}\n{:<35} {}", "input", self.input);
-        for NamedLayer { name, spec, layer, params, statistics, .. } in &self.layers {
-            let count = group_digits((params.len() + statistics.len()) as u64);
-            let multiply_adds = match layer.multiply_adds() {
-                0 => String::new(),
-                number => group_digits(number),
-            };
-            let output = layer.output().to_string();
-            let line = format!("{name:<10} {:<24} {output:<14} {count:>10} {multiply_adds:>14}", spec.describe());
-            let _ = writeln!(text, "{}", line.trim_end());
-        }
-        let (trainable, fixed) = (self.count(true) as u64, self.count(false) as u64);
-        let _ = writeln!(text, "{rule}\nTotal params: {}", group_digits(trainable + fixed));
-        let _ = writeln!(text, "Trainable params: {}", group_digits(trainable));
-        let _ = writeln!(text, "Non-trainable params: {}", group_digits(fixed));
-        let _ = writeln!(text, "Multiply-adds per image: {}", group_digits(self.multiply_adds()));
-        text
-    }
-}
-
-/// `1234567` as `1,234,567`.
-pub fn group_digits(number: u64) -> String {
-    let digits = number.to_string();
-    let mut text = String::with_capacity(digits.len() + digits.len() / 3);
-    for (i, digit) in digits.chars().enumerate() {
-        if i > 0 && (digits.len() - i).is_multiple_of(3) {
-            text.push(',');
-        }
-        text.push(digit);
-    }
-    text
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn parse(text: &str) -> Vec<LayerSpec> {
-        #[derive(serde::Deserialize)]
-        struct Layers {
-            layers: Vec<LayerSpec>,
-        }
-        toml::from_str::<Layers>(text).unwrap().layers
-    }
-
-    #[test]
-    fn layers_are_named_by_kind_and_number() {
-        let specs = parse("layers = [{kind='dense', units=3}, {kind='relu'}, {kind='dense', units=1}]");
-        let network = Network::new(Shape::vector(2), &specs, Isa::PORTABLE).unwrap();
-        let names: Vec<_> = network.tensors().iter().map(|t| t.name.as_str()).collect();
-        assert_eq!(names, ["dense1.weight", "dense1.bias", "dense2.weight", "dense2.bias"]);
-        assert_eq!((network.count(true), network.count(false)), (2 * 3 + 3 + 3 + 1, 0));
-    }
-
-    #[test]
-    fn a_layer_that_does_not_fit_is_named() {
-        let specs = parse("layers = [{kind='max_pool', window=[2, 2]}, {kind='conv2d', filters=1, kernel=[3, 3]}]");
-        let error = Network::new(Shape::new(1, 4, 4), &specs, Isa::PORTABLE).unwrap_err();
-        assert_eq!(error.to_string(), "layer `conv1`: a 3x3 kernel does not fit into the 2x2 input");
-    }
-
-    #[test]
-    fn digits_are_grouped_by_three() {
-        assert_eq!(group_digits(7), "7");
-        assert_eq!(group_digits(176_159), "176,159");
-        assert_eq!(group_digits(13_864_346), "13,864,346");
-    }
-}
+pub use crate::engine::parameters::{Parameters, Tensor};

@@ -1,4 +1,4 @@
-//! Evaluation of one image layer by layer, so that what each layer makes of it can be looked at.
+//! Evaluation of one image layer by layer, for whoever looks at the output of each layer.
 
 use super::{Network, Parameters};
 
@@ -20,8 +20,8 @@ impl ObservationPlan {
         ObservationPlan { buffers: [vec![0.0; largest], vec![0.0; largest]], scratch: vec![0.0; scratch] }
     }
 
-    /// Runs the network on the image `x`, `[c][h][w]`, fills `y`, `[outputs]`, and tells `seen` the place and the output of
-    /// each layer that computes something.
+    /// Runs the network on the image `x`, `[c][h][w]`, fills `y`, `[outputs]`, and calls `seen` with the index in
+    /// [`Network::layers`] and the output of each layer that computes something.
     ///
     /// # Panics
     ///

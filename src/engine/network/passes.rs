@@ -1,48 +1,41 @@
-//! The passes of a training step over some images of a shard: what all shards share, and the stages forward and backward.
+//! The passes of a training step over a group of images of a shard: stages forward, loss, stages backward.
 
 use std::ops::Range;
 
+use super::fused::{FusedStage, Kind, replaces_input};
 use super::shard::Shard;
-use super::stages::{Kind, Stage, replaces_input};
+use super::step_input::StepSlices;
 use super::step_profile::StepTimes;
-use super::training::StepInput;
 use super::{Network, Parameters};
 use crate::engine::layers::{BatchStatistics, Grads, Pair, Pass};
 use crate::engine::loss::Loss;
 
-/// What all shards share during a pass.
+/// What all shards share during a pass of a training step.
 #[derive(Clone, Copy)]
-pub(super) struct Run<'a> {
+pub(super) struct StepContext<'a> {
     pub network: &'a Network,
     pub parameters: &'a Parameters,
-    pub stages: &'a [Stage],
-    pub prepared: &'a [Vec<f32>],
+    pub stages: &'a [FusedStage],
+    pub packed: &'a [Vec<f32>],
     pub moments: &'a [f32],
     pub moments_of: &'a [Range<usize>],
     pub first_learning: usize,
-    pub input: StepInput<'a>,
+    pub input: StepSlices<'a>,
     pub times: &'a StepTimes,
 }
 
-impl<'a> Run<'a> {
+impl<'a> StepContext<'a> {
     fn pass(&self, stage: usize, first_image: usize) -> Pass<'a> {
         let moments = &self.moments[self.moments_of[stage].clone()];
         let layer = self.stages[stage].layers.start;
-        Pass {
-            seed: self.input.seed,
-            step: self.input.step,
-            layer,
-            first_image,
-            moments,
-            packed: &self.prepared[stage],
-        }
+        Pass { seed: self.input.seed, step: self.input.step, layer, first_image, moments, packed: &self.packed[stage] }
     }
 
     fn params(&self, stage: usize) -> &'a [f32] {
         &self.parameters.values[self.stages[stage].params(self.network)]
     }
 
-    /// The input of `stage` for `images` of the batch; `first` is that whose activations come first.
+    /// The input of `stage` for `images` of the batch; `first` is the image whose activations come first in the buffers.
     fn stage_input<'b>(
         &self,
         stage: usize,
@@ -76,14 +69,14 @@ impl<'a> Run<'a> {
                 }
                 Kind::NormRectify(fused) => fused.forward(params, &pass, n, x, y),
                 Kind::PooledConv(fused) => {
-                    let places = &mut shard.buffers.places[index][offset * outputs..][..n * outputs];
-                    fused.forward(&pass, n, x, y, places, &mut shard.scratch);
+                    let argmax = &mut shard.buffers.argmax[index][offset * outputs..][..n * outputs];
+                    fused.forward(&pass, n, x, y, argmax, &mut shard.scratch);
                 }
             });
         }
     }
 
-    /// Adds the images' losses to the shard's, and puts the gradient of the mean loss into `d_output`.
+    /// Adds the losses of `images` to the shard's and overwrites `d_output` with the gradient of the mean loss.
     pub fn loss(&self, loss: &Loss, shard: &mut Shard, images: Range<usize>) {
         debug_assert_eq!(images.start, shard.first, "the loss is taken of all images in the buffers");
         let outputs = self.network.output().len();
@@ -98,7 +91,7 @@ impl<'a> Run<'a> {
         shard.buffers.in_place = false;
     }
 
-    /// Takes the gradient of the output of the last of `stages` back to the input of the first.
+    /// Backward pass of `stages`: from the gradient of the last one's output to that of the first one's input.
     pub fn backward(&self, stages: Range<usize>, shard: &mut Shard, images: Range<usize>) {
         for index in stages.rev().filter(|index| *index >= self.first_learning) {
             let stage = &self.stages[index];
@@ -108,7 +101,7 @@ impl<'a> Run<'a> {
             let (of_x, of_y) = (place(stage.input_len(self.network)), place(stage.output_len(self.network)));
             let (params, pass) = (self.params(index), self.pass(index, images.start));
             let replaces = stage.source.filter(|_| replaces_input(self.network, self.stages, index));
-            // Nobody asks for the gradient of the images themselves, or of what comes before all that learns.
+            // No stage needs the gradient of the images, or of the outputs before the first stage that learns.
             let wanted = stage.source.filter(|source| *source >= self.first_learning);
             self.times.stages[index][1].time(|| match &stage.kind {
                 Kind::NormRectify(fused) => {
@@ -126,7 +119,7 @@ impl<'a> Run<'a> {
                     let dx = wanted.map(|_| &mut shard.buffers.d_input[of_x]);
                     let dparams = &mut shard.gradient[stage.params(self.network)];
                     let grads = Grads { dparams, scratch: &mut shard.scratch };
-                    fused.backward(params, n, pair, &shard.buffers.places[index][of_y], dx, grads);
+                    fused.backward(params, n, pair, &shard.buffers.argmax[index][of_y], dx, grads);
                 }
                 Kind::Layer => {
                     let layer = &self.network.layers()[stage.layers.start].layer;
@@ -153,7 +146,7 @@ impl<'a> Run<'a> {
         }
     }
 
-    /// Adds the sums over the images that the barrier is for to the shard's.
+    /// Adds the forward sums of the barrier over `images` to the shard's.
     pub fn forward_sums(&self, stage: usize, barrier: &dyn BatchStatistics, shard: &mut Shard, images: Range<usize>) {
         let x = self.stage_input(stage, &shard.buffers.activations, shard.first, images.clone());
         let sums = &mut shard.group_sums[..barrier.sums_len()];
@@ -161,7 +154,7 @@ impl<'a> Run<'a> {
         shard.add_group_sums(barrier.sums_len());
     }
 
-    /// The same on the way back.
+    /// Adds the backward sums of the barrier over `images` to the shard's.
     pub fn backward_sums(&self, index: usize, barrier: &dyn BatchStatistics, shard: &mut Shard, images: Range<usize>) {
         let stage = &self.stages[index];
         let n = images.len();

@@ -24,14 +24,14 @@ pub(super) struct Shard {
     pub loss: f64,
 }
 
-/// The maps of a shard. With a barrier the activations have to wait there, and each shard has its own. Without one a shard is done
-/// with them when it is done.
+/// The activations and gradients of a shard. In a network with a barrier each shard keeps its own, because they outlive the barrier;
+/// without one a shard hands them on when its images are done.
 #[derive(Debug, Default)]
 pub(super) struct Buffers {
     /// Output of each stage.
     pub activations: Vec<Vec<f32>>,
-    /// Where each [`PooledConv`](crate::engine::layers::PooledConv) found its largest; empty for the others.
-    pub places: Vec<Vec<u32>>,
+    /// Argmax indices of each stage that is a pooled convolution; empty for the others.
+    pub argmax: Vec<Vec<u32>>,
     /// Gradient with respect to the current stage's output, and to its input.
     pub d_output: Vec<f32>,
     pub d_input: Vec<f32>,
@@ -39,8 +39,8 @@ pub(super) struct Buffers {
     pub in_place: bool,
 }
 
-/// Buffers that are not in use. Those put back last are taken first, so that no more are ever touched than threads are at work,
-/// and they are still in the cache.
+/// Buffers that no shard uses, last in, first out: threads touch no more of them than there are threads, and find them in the
+/// cache.
 #[derive(Debug)]
 pub(super) struct Spare<T>(Mutex<Vec<T>>);
 
@@ -82,7 +82,7 @@ impl Shard {
         }
     }
 
-    /// How many images the activations have room for.
+    /// Number of images that the activations have room for.
     pub fn group_capacity(&self, network: &Network) -> usize {
         self.buffers.activations.last().map_or(self.images.len(), |last| last.len() / network.output().len()).max(1)
     }

@@ -1,15 +1,15 @@
 //! Where the time of training steps goes, stage by stage.
 
 use super::Network;
-use super::stages::Stage;
+use super::fused::FusedStage;
 use crate::engine::stopwatch::Stopwatch;
 
-/// The stopwatches of a plan; all are off until it is to measure.
+/// The stopwatches of a plan; off until [`measure`](super::TrainingPlan::measure).
 #[derive(Clone, Debug)]
 pub(super) struct StepTimes {
     /// Forward and backward of each stage.
     pub stages: Vec<[Stopwatch; 2]>,
-    /// Adding the shards' gradients up.
+    /// The reduction of the shards' gradients.
     pub reduce: Stopwatch,
 }
 
@@ -23,24 +23,29 @@ impl StepTimes {
     }
 }
 
-/// The time that one stage, layers that run as one, took in all steps so far: CPU time, summed over threads.
+/// CPU time of one stage (layers that run as one) in all steps so far, summed over threads.
 #[derive(Clone, Debug, PartialEq)]
 pub struct StageTime {
     /// The layers' names, joined by `+`.
     pub layers: String,
     /// Seconds of the forward pass, batch-norm sums included.
     pub forward_s: f64,
-    /// Seconds of the backward pass: gradients of parameters and, where it is asked for, of the input.
+    /// Seconds of the backward pass.
     pub backward_s: f64,
-    /// Multiply-adds an image of convolutions and dense layers, forward.
+    /// Multiply-adds of one image in the stage's convolutions and dense layers, forward.
     pub forward_multiply_adds: u64,
-    /// The same, backward: as many for each gradient that is asked for.
+    /// The same, backward: as many again for each gradient that is computed (weights; input).
     pub backward_multiply_adds: u64,
 }
 
 impl StageTime {
-    pub(super) fn of(network: &Network, stages: &[Stage], times: &StepTimes, first_learning: usize) -> Vec<StageTime> {
-        let of_stage = |(index, (stage, [forward, backward])): (usize, (&Stage, &[Stopwatch; 2]))| {
+    pub(super) fn of(
+        network: &Network,
+        stages: &[FusedStage],
+        times: &StepTimes,
+        first_learning: usize,
+    ) -> Vec<StageTime> {
+        let of_stage = |(index, (stage, [forward, backward])): (usize, (&FusedStage, &[Stopwatch; 2]))| {
             let layers = &network.layers()[stage.layers.clone()];
             let names: Vec<&str> = layers.iter().map(|layer| layer.name.as_str()).collect();
             let multiply_adds: u64 = layers.iter().map(|layer| layer.layer.multiply_adds()).sum();

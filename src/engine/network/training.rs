@@ -4,35 +4,37 @@
 //! activations, a gradient arena and scratch of its own, and is worked on by one thread; gradients and batch-norm sums are
 //! added in the order of the shards. So the result has the same bits for any number of threads.
 //!
-//! Between two batch-norm barriers a shard takes a few images at a time through all layers, so that what one layer writes is
-//! still in the cache when the next reads it. A network without batch norm has no barrier at all: then a shard takes them
-//! forward *and* backward, and needs buffers for no more of them.
+//! Between two batch-norm barriers a shard takes a group of a few images through all layers, so that the output of one layer is
+//! still in the cache when the next layer reads it. A network without batch norm has no barrier: each group goes forward *and*
+//! backward, and the buffers hold one group only.
 
 use std::ops::Range;
 
 use rayon::prelude::*;
 use steersman_kernels::{Isa, update};
 
-use super::passes::Run;
+use super::fused::{FusedStage, replaces_input, stages};
+use super::passes::StepContext;
 use super::shard::{Buffers, Shard, Spare, groups, total};
-use super::stages::{Stage, replaces_input, stages};
+use super::step_input::{StepInput, StepSlices};
 use super::step_profile::{StageTime, StepTimes};
 use super::{Network, Parameters};
 use crate::engine::layers::BatchStatistics;
 use crate::engine::loss::Loss;
+use crate::engine::parameters::CHUNK;
 use crate::engine::stopwatch::Stopwatch;
 
-/// Most shards a batch is cut into: enough to keep 16 threads busy.
-pub const MAX_SHARDS: usize = 16;
+/// Upper limit of the shards of a batch: enough to keep 16 threads busy.
+const MAX_SHARDS: usize = 16;
 
-/// How many images a shard takes at a time.
+/// Limits of a group: the images that a shard takes through the layers at a time.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct GroupLimits {
-    /// What goes in and out between two barriers, in numbers.
+    /// Length of the inputs and outputs between two barriers.
     pub segment_numbers: usize,
-    /// All activations, in numbers, in networks without a barrier.
+    /// Length of all activations, in networks without a barrier.
     pub group_numbers: usize,
-    /// Fewest images in networks without a barrier, if the shard has as many.
+    /// Minimum of images in networks without a barrier, if the shard has as many.
     pub min_group: usize,
 }
 
@@ -40,22 +42,6 @@ pub(super) struct GroupLimits {
 /// in a call. About 1 MiB without barriers, but 8 images, because the weight gradient has a cost for each call.
 pub(super) const GROUP_LIMITS: GroupLimits =
     GroupLimits { segment_numbers: 512 * 1024, group_numbers: 256 * 1024, min_group: 8 };
-
-/// Parameters that are reduced and updated as one task.
-pub const CHUNK: usize = 4096;
-
-/// The batch of one training step.
-#[derive(Clone, Copy, Debug)]
-pub struct StepInput<'a> {
-    /// Images, `[n][c][h][w]`.
-    pub x: &'a [f32],
-    /// What the network should say, `[n][outputs]`.
-    pub labels: &'a [f32],
-    /// Seed of the run (for dropout).
-    pub seed: u64,
-    /// Number of the step, from 0 (for dropout).
-    pub step: u64,
-}
 
 /// The buffers of a training step, planned once for a network and a largest batch.
 #[derive(Debug)]
@@ -69,22 +55,24 @@ pub struct TrainingPlan {
     gradient: Vec<f32>,
     /// Sum of squares of each chunk of the gradient.
     chunk_squares: Vec<f64>,
-    stages: Vec<Stage>,
-    /// The parameters of each stage as its passes read them, made anew in every step.
-    prepared: Vec<Vec<f32>>,
-    /// What the barriers found out about the batch, all stages one after the other.
+    stages: Vec<FusedStage>,
+    /// The packed weights of each stage, made anew in every step.
+    packed: Vec<Vec<f32>>,
+    /// Means and variances of the batch from the barriers, all stages one after the other.
     moments: Vec<f32>,
     /// Where each stage's part of `moments` lies.
     moments_of: Vec<Range<usize>>,
     sums: Vec<f64>,
     /// Runs of stages without a barrier inside; each but the first begins with the stage that needs the barrier.
     segments: Vec<Range<usize>>,
-    /// How many images go through each segment at a time.
+    /// Size of a group in each segment.
     segment_groups: Vec<usize>,
-    /// The first stage that learns: below it nobody asks for a gradient.
+    /// The first stage that learns: no gradient is computed before it.
     first_learning: usize,
     capacity: usize,
     isa: Isa,
+    /// [`Network::fingerprint`] of the network it was planned for.
+    fingerprint: u64,
     times: StepTimes,
 }
 
@@ -97,7 +85,7 @@ impl TrainingPlan {
     pub(super) fn with_stages(
         network: &Network,
         capacity: usize,
-        stages: Vec<Stage>,
+        stages: Vec<FusedStage>,
         limits: GroupLimits,
     ) -> TrainingPlan {
         let mut moments_of = Vec::new();
@@ -118,7 +106,7 @@ impl TrainingPlan {
         let segments: Vec<_> = segment_starts.iter().copied().zip(ends).map(|(start, end)| start..end).collect();
 
         let per_image: usize = stages.iter().map(|stage| stage.output_len(network)).sum();
-        // What is not put in the place of an activation: the gradient of the last output, and of the inputs of the others.
+        // The gradients that replace no activation: that of the network's output, and of the inputs of the other stages.
         let gradients = stages.iter().enumerate().filter(|(index, _)| !replaces_input(network, &stages, *index));
         let largest = gradients.map(|(_, stage)| stage.input_len(network)).chain([network.output().len()]).max();
         let largest = largest.unwrap_or(0);
@@ -137,7 +125,7 @@ impl TrainingPlan {
         let mut spare: Vec<Buffers> = (0..capacity.min(MAX_SHARDS))
             .map(|_| Buffers {
                 activations: stages.iter().map(|stage| vec![0.0; group * stage.output_len(network)]).collect(),
-                places: stages.iter().map(|stage| vec![0; stage.places_len(network) * group]).collect(),
+                argmax: stages.iter().map(|stage| vec![0; stage.argmax_len(network) * group]).collect(),
                 d_output: vec![0.0; group * largest],
                 d_input: vec![0.0; group * largest],
                 in_place: false,
@@ -163,7 +151,7 @@ impl TrainingPlan {
             chunk_squares: vec![0.0; network.count(true).div_ceil(CHUNK)],
             first_learning: stages.iter().position(|stage| stage.learns(network)).unwrap_or(stages.len()),
             times: StepTimes::off(stages.len()),
-            prepared: stages
+            packed: stages
                 .iter()
                 .map(|stage| stage.packing(network).map_or(0, |packing| packing.training_packed_len()))
                 .map(|len| vec![0.0; len])
@@ -176,6 +164,7 @@ impl TrainingPlan {
             segment_groups,
             capacity,
             isa: network.isa(),
+            fingerprint: network.fingerprint(),
         }
     }
 
@@ -194,29 +183,30 @@ impl TrainingPlan {
         self.chunk_squares.iter().sum::<f64>().sqrt()
     }
 
-    /// Measures from now on how long each stage takes; `reduce` gets the time for adding the shards' gradients up.
+    /// Measures the time of each stage from now on; `reduce` gets the time of the reduction of the shards' gradients.
     pub fn measure(&mut self, reduce: Stopwatch) {
         self.times = StepTimes::on(self.stages.len(), reduce);
     }
 
-    /// What [`measure`](TrainingPlan::measure) has found so far, in the order of the layers.
+    /// The times since [`measure`](TrainingPlan::measure), in the order of the layers.
     pub fn stage_times(&self, network: &Network) -> Vec<StageTime> {
         StageTime::of(network, &self.stages, &self.times, self.first_learning)
     }
 
-    /// Computes the mean loss of the batch and leaves its gradient in [`gradient`](TrainingPlan::gradient). Of the
+    /// Computes the mean loss of the batch and writes its gradient to [`gradient`](TrainingPlan::gradient). Of the
     /// parameters only the running statistics change. Allocates nothing when called inside a rayon pool.
     ///
     /// # Panics
     ///
-    /// Panics if `network` is not the one the plan was made for, or the batch is empty or larger than planned.
+    /// Panics if `network` differs from the one the plan was made for (in input shape, layers, options, frozen layers or vector
+    /// code), if `parameters` are not those of such a network, or if the batch is empty, larger than planned, of the wrong shape
+    /// or not in standard order.
     pub fn step(&mut self, network: &Network, parameters: &mut Parameters, loss: &Loss, input: StepInput) -> f64 {
+        assert_eq!(self.fingerprint, network.fingerprint(), "a training plan for another network");
+        network.check_parameters(parameters);
+        let input = input.slices(network);
         let n = input.x.len() / network.input().len();
         assert!(n > 0 && n <= self.capacity, "a batch of {n} images in a plan for 1 to {}", self.capacity);
-        assert_eq!(input.x.len(), n * network.input().len());
-        assert_eq!(input.labels.len(), n * network.output().len());
-        let planned = self.stages.last().map_or(0, |stage| stage.layers.end);
-        assert!(network.layers()[planned..].iter().all(|layer| layer.layer.is_view()), "a plan for another network");
 
         let shard_images = n.div_ceil(MAX_SHARDS);
         let used = n.div_ceil(shard_images);
@@ -224,7 +214,7 @@ impl TrainingPlan {
             shard.images = index * shard_images..((index + 1) * shard_images).min(n);
         }
         self.freeze_moments(network, parameters);
-        self.prepare(network, parameters);
+        self.pack(network, parameters);
         if self.segments.len() == 1 {
             self.step_without_barriers(network, parameters, loss, input, used);
         } else {
@@ -234,9 +224,9 @@ impl TrainingPlan {
         self.shards[..used].iter().map(|shard| shard.loss).sum::<f64>() / input.labels.len() as f64
     }
 
-    /// Puts the parameters in the order in which the passes read them, once for all shards.
-    fn prepare(&mut self, network: &Network, parameters: &Parameters) {
-        self.prepared.par_iter_mut().zip(&self.stages).for_each(|(to, stage)| {
+    /// Packs the weights once for all shards.
+    fn pack(&mut self, network: &Network, parameters: &Parameters) {
+        self.packed.par_iter_mut().zip(&self.stages).for_each(|(to, stage)| {
             if let Some(packing) = stage.packing(network) {
                 packing.pack_for_training(&parameters.values[stage.params(network)], to);
             }
@@ -260,7 +250,7 @@ impl TrainingPlan {
         network: &Network,
         parameters: &Parameters,
         loss: &Loss,
-        input: StepInput,
+        input: StepSlices,
         used: usize,
     ) {
         let TrainingPlan {
@@ -268,7 +258,7 @@ impl TrainingPlan {
             spare_buffers,
             spare_scratch,
             stages,
-            prepared,
+            packed,
             moments,
             moments_of,
             first_learning,
@@ -276,7 +266,8 @@ impl TrainingPlan {
             ..
         } = self;
         let first_learning = *first_learning;
-        let run = Run { network, parameters, stages, prepared, moments, moments_of, first_learning, input, times };
+        let run =
+            StepContext { network, parameters, stages, packed, moments, moments_of, first_learning, input, times };
         shards[..used].par_iter_mut().for_each(|shard| {
             shard.reset();
             shard.buffers = spare_buffers.take();
@@ -298,14 +289,14 @@ impl TrainingPlan {
         network: &Network,
         parameters: &mut Parameters,
         loss: &Loss,
-        input: StepInput,
+        input: StepSlices,
         used: usize,
     ) {
         let TrainingPlan {
             shards,
             spare_scratch,
             stages,
-            prepared,
+            packed,
             moments,
             moments_of,
             sums,
@@ -324,7 +315,8 @@ impl TrainingPlan {
         let last = segments.len() - 1;
 
         for (index, segment) in segments.iter().enumerate() {
-            let run = Run { network, parameters, stages, prepared, moments, moments_of, first_learning, input, times };
+            let run =
+                StepContext { network, parameters, stages, packed, moments, moments_of, first_learning, input, times };
             let next_barrier = segments.get(index + 1).map(|next| next.start);
             shards.par_iter_mut().for_each(|shard| {
                 if index == 0 {
@@ -355,7 +347,8 @@ impl TrainingPlan {
             }
         }
         for (index, segment) in segments.iter().enumerate().rev() {
-            let run = Run { network, parameters, stages, prepared, moments, moments_of, first_learning, input, times };
+            let run =
+                StepContext { network, parameters, stages, packed, moments, moments_of, first_learning, input, times };
             // The stage at the start of a segment waits for the sums over all shards.
             let rest = if index > 0 { segment.start + 1..segment.end } else { segment.clone() };
             shards.par_iter_mut().for_each(|shard| {
@@ -384,7 +377,7 @@ impl TrainingPlan {
         }
     }
 
-    /// Adds the shards' gradients up, in their order. Those of frozen layers count as 0.
+    /// Adds the shards' gradients in the order of the shards. The gradients of frozen layers become 0.
     fn reduce_gradient(&mut self, network: &Network, used: usize) {
         let TrainingPlan { shards, gradient, chunk_squares, isa, times, .. } = self;
         let shards = &shards[..used];
@@ -409,11 +402,11 @@ impl TrainingPlan {
     }
 }
 
-/// How many images should go through a segment at a time: `None` where they cannot be told apart, because a gradient on the way
-/// back leaves its place among the activations.
+/// The size of a group in `segment`; `None` if the shard must go through it as a whole, because the backward pass moves a gradient
+/// out of the activations into a buffer of its own.
 fn segment_group(
     network: &Network,
-    stages: &[Stage],
+    stages: &[FusedStage],
     segments: &[Range<usize>],
     segment: usize,
     limits: GroupLimits,

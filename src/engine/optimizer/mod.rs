@@ -15,12 +15,13 @@ use std::ops::Range;
 use rayon::prelude::*;
 pub use schedule::{Plateau, Schedule, ScheduleSpec};
 use serde::{Deserialize, Serialize};
+use steersman_kernels::Isa;
 use steersman_kernels::update::{AdamStep, adam, scale, sgd_momentum};
 
-use crate::engine::network::{CHUNK, Network};
+use crate::engine::parameters::{CHUNK, Tensor};
 use crate::engine::stopwatch::Stopwatch;
 
-/// How parameters follow the gradient.
+/// The algorithm that updates parameters along the gradient.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
 pub enum OptimizerSpec {
@@ -82,7 +83,7 @@ impl OptimizerSpec {
         }
     }
 
-    /// What is wrong with the numbers, if anything is.
+    /// Checks the ranges of all numbers; the error names the first that is wrong.
     pub fn check(&self) -> Result<(), String> {
         let (positive, fractions, not_negative) = match *self {
             OptimizerSpec::Adam { learning_rate, beta1, beta2, epsilon, l2, decoupled_weight_decay } => (
@@ -115,7 +116,7 @@ impl OptimizerSpec {
     }
 }
 
-/// The state of an optimizer: its clock and its moving averages, one number each a parameter.
+/// The state of an optimizer: its number of updates, and its moving averages, each with one element for each parameter.
 #[derive(Clone, Debug)]
 pub struct Optimizer {
     spec: OptimizerSpec,
@@ -127,12 +128,12 @@ pub struct Optimizer {
     pub first: Vec<f32>,
     /// Adam's mean of the squared gradient; empty for SGD.
     pub second: Vec<f32>,
-    /// Runs of parameters within a chunk that do or do not decay, in order; frozen ones belong to none.
+    /// Ranges of a chunk that decay or do not, in order; frozen parameters belong to none.
     pieces: Vec<Piece>,
-    /// Where the pieces of each chunk lie.
+    /// The range of `pieces` of each chunk.
     pieces_of_chunk: Vec<Range<usize>>,
-    isa: steersman_kernels::Isa,
-    /// Gets the time of all updates.
+    isa: Isa,
+    /// Sums the time of all updates.
     time: Stopwatch,
 }
 
@@ -144,16 +145,16 @@ struct Piece {
 }
 
 impl Optimizer {
-    /// A fresh optimizer for the parameters of `network` that are not frozen; gradients with an L2 norm above `clip_norm` count as if they
-    /// were scaled down to it.
-    pub fn new(spec: OptimizerSpec, clip_norm: Option<f64>, network: &Network) -> Optimizer {
-        let count = network.count(true);
+    /// A fresh optimizer for those of a network's `tensors` that are trainable and not frozen, with the vector code of `isa`. A
+    /// gradient whose L2 norm exceeds `clip_norm` is scaled down to that norm.
+    pub fn new(spec: OptimizerSpec, clip_norm: Option<f64>, tensors: &[Tensor], isa: Isa) -> Optimizer {
+        let count = tensors.iter().filter(|t| t.trainable).map(|t| t.range.len()).sum();
         let mut pieces = Vec::new();
         let mut pieces_of_chunk = Vec::new();
         for start in (0..count).step_by(CHUNK) {
             let end = (start + CHUNK).min(count);
             let first = pieces.len();
-            for tensor in network.tensors().iter().filter(|t| t.trainable && !t.frozen) {
+            for tensor in tensors.iter().filter(|t| t.trainable && !t.frozen) {
                 let (from, to) = (tensor.range.start.max(start), tensor.range.end.min(end));
                 if from < to {
                     pieces.push(Piece { range: from - start..to - start, decays: tensor.spec.decays });
@@ -165,7 +166,6 @@ impl Optimizer {
             OptimizerSpec::Adam { .. } => vec![0.0; count],
             OptimizerSpec::Sgd { .. } => Vec::new(),
         };
-        let isa = network.isa();
         Optimizer {
             spec,
             clip_norm,
@@ -179,16 +179,25 @@ impl Optimizer {
         }
     }
 
-    /// Adds the time that updates take from now on to `time`.
+    /// Measures from now on: adds the time of updates to `time`.
     pub fn measure(&mut self, time: Stopwatch) {
         self.time = time;
     }
 
-    /// One update of all `params` along `gradient`, whose L2 norm is `gradient_norm`, with learning rate `lr`. A gradient
-    /// beyond the limit is scaled down in place.
+    /// Updates all `params` along `gradient`, whose L2 norm is `gradient_norm`, with learning rate `lr`. Clips the gradient in
+    /// place.
     ///
-    /// The clock goes on by one for the whole update, not once a tensor. Allocates nothing inside a rayon pool.
+    /// Counts one update for all tensors together. Allocates nothing inside a rayon pool.
+    ///
+    /// # Panics
+    ///
+    /// Panics if `params` and `gradient` have another length than the trainable tensors.
     pub fn step(&mut self, lr: f64, params: &mut [f32], gradient: &mut [f32], gradient_norm: f64) {
+        assert_eq!(
+            (params.len(), gradient.len()),
+            (self.first.len(), self.first.len()),
+            "parameters of another network"
+        );
         self.updates += 1;
         let (isa, time) = (self.isa, &self.time);
         if let Some(limit) = self.clip_norm.filter(|limit| gradient_norm > *limit) {
@@ -245,9 +254,8 @@ impl Optimizer {
 mod tests {
     use super::*;
     use crate::engine::layers::DenseSpec;
-    use crate::engine::network::LayerSpec;
+    use crate::engine::network::{LayerSpec, Network};
     use crate::engine::tensor::{Initializer, Shape};
-    use steersman_kernels::Isa;
 
     /// Two dense layers: 5 x 1000 weights and 1000 biases, then 1000 weights and 1 bias; more than one chunk.
     fn network() -> Network {
@@ -268,7 +276,7 @@ mod tests {
     fn after(spec: OptimizerSpec, clip_norm: Option<f64>, g: f32, steps: usize) -> [f32; 3] {
         let network = network();
         let count = network.count(true);
-        let mut optimizer = Optimizer::new(spec, clip_norm, &network);
+        let mut optimizer = Optimizer::new(spec, clip_norm, network.tensors(), network.isa());
         let mut params = vec![1.0; count];
         for _ in 0..steps {
             let mut gradient = vec![g; count];
@@ -282,7 +290,7 @@ mod tests {
 
     #[test]
     fn the_first_adam_step_has_the_size_of_the_learning_rate_for_every_tensor() {
-        // Bias correction makes m / sqrt(v) the sign of the gradient. A clock that ran once a tensor would shrink the later ones.
+        // Bias correction makes m / sqrt(v) the sign of the gradient. One update counted for each tensor would shrink the later ones.
         for value in after(adam_spec(0.0, 0.0), None, 0.01, 1) {
             approx::assert_relative_eq!(value, 0.9, max_relative = 1e-4);
         }

@@ -6,10 +6,10 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ScheduleSpec {
-    /// After the warm-up.
+    /// The rate after the warm-up.
     #[serde(default)]
     pub shape: Schedule,
-    /// The first updates, over which the rate rises in a straight line; update number k (from 1) has k / warmup of it.
+    /// Number of updates of the warm-up: update k (from 1) has the fraction `k / warmup_updates` of the rate.
     #[serde(default)]
     pub warmup_updates: u64,
 }
@@ -27,7 +27,7 @@ pub enum Schedule {
     },
     /// Half a cosine from 1 at the start to `final_fraction` at the end of the last epoch.
     Cosine {
-        /// Where it ends.
+        /// Fraction at the end of the last epoch.
         #[serde(default)]
         final_fraction: f64,
     },
@@ -49,7 +49,7 @@ impl Default for Schedule {
     }
 }
 
-/// What [`Schedule::ReduceOnPlateau`] remembers between epochs.
+/// State of [`Schedule::ReduceOnPlateau`] between epochs.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Plateau {
     fraction: f64,
@@ -82,7 +82,7 @@ impl ScheduleSpec {
         warmup * shape
     }
 
-    /// Tells the plateau the validation loss of an epoch.
+    /// Updates the plateau with the validation loss of an epoch.
     pub fn end_epoch(&self, validation_loss: f64, plateau: &mut Plateau) {
         let Schedule::ReduceOnPlateau { factor, patience_epochs, min_fraction } = self.shape else { return };
         if plateau.lowest.is_none_or(|lowest| validation_loss < lowest) {
@@ -97,7 +97,7 @@ impl ScheduleSpec {
         }
     }
 
-    /// What is wrong with the numbers, if anything is.
+    /// Checks the ranges of all numbers; the error names the first that is wrong.
     pub fn check(&self) -> Result<(), String> {
         let fraction = |name: &str, value: f64| match (0.0..=1.0).contains(&value) {
             true => Ok(()),

@@ -4,16 +4,17 @@
 //! its own length.
 
 use std::collections::BTreeMap;
-use std::io::{Cursor, Read};
+use std::io::Cursor;
 use std::path::Path;
 
-use hdf5_reader::{Attribute, Dataset, Hdf5File, OpenOptions, group::Group};
 use serde::Deserialize;
 
 use super::architecture::KerasLayer;
+use super::hdf5::{self, Attribute, Dataset, Group};
 use super::limits::MAX_JSON_BYTES;
 use super::messages::{shown, shown_list};
 use crate::error::{Error, Result};
+use crate::files::zip_archive::ZipArchive;
 
 /// Larger files are refused: networks that steer have megabytes.
 const MAX_FILE_BYTES: u64 = 1 << 30;
@@ -50,33 +51,27 @@ impl KerasFile {
 
     fn from_zip(bytes: Vec<u8>) -> Result<KerasFile, String> {
         let limit = inflated(bytes.len());
-        let mut archive =
-            zip::ZipArchive::new(Cursor::new(bytes)).map_err(|e| format!("is no zip archive, or is damaged: {e}"))?;
+        let mut source = Cursor::new(bytes);
+        let archive = ZipArchive::open(&mut source)?;
         let mut entry = |name: &str, limit: usize| -> Result<Vec<u8>, String> {
-            let file = archive.by_name(name).map_err(|e| format!("has no `{name}`: {e}"))?;
-            let mut content = Vec::new();
-            let read = file.take(limit as u64 + 1).read_to_end(&mut content);
-            read.map_err(|e| format!("`{name}` is damaged: {e}"))?;
-            match content.len() > limit {
-                true => Err(format!("`{name}` unpacks to more than {limit} bytes, which is too long for it")),
-                false => Ok(content),
-            }
+            let entry = archive.find(name).ok_or_else(|| format!("has no `{name}`"))?;
+            ZipArchive::read(&mut source, entry, limit as u64).map_err(|message| format!("`{name}` {message}"))
         };
         let text = |bytes: Vec<u8>, name: &str| String::from_utf8(bytes).map_err(|_| format!("`{name}` is no text"));
         let architecture = text(entry("config.json", MAX_JSON_BYTES)?, "config.json")?;
         let metadata = entry("metadata.json", MAX_JSON_BYTES).ok();
         let metadata = metadata.and_then(|bytes| serde_json::from_slice::<Metadata>(&bytes).ok());
-        let file = open_hdf5(entry("model.weights.h5", limit)?)?;
+        let root = open_hdf5(entry("model.weights.h5", limit)?)?;
         Ok(KerasFile {
             architecture: Some(architecture),
             keras_version: metadata.and_then(|metadata| metadata.keras_version).map(|version| shown(&version)),
             backend: None,
-            weights: Weights::find(&root(&file)?)?,
+            weights: Weights::find(&root)?,
         })
     }
 
     fn from_hdf5(bytes: Vec<u8>) -> Result<KerasFile, String> {
-        let root = root(&open_hdf5(bytes)?)?;
+        let root = open_hdf5(bytes)?;
         let text = |name: &str| strings(&root, name).ok().and_then(|mut all| all.pop());
         let weights = Weights::find(&root)?;
         let beside_weights = |name: &str| strings(&weights.group, name).ok().and_then(|mut all| all.pop());
@@ -104,24 +99,14 @@ fn inflated(len: usize) -> usize {
     len.saturating_mul(INFLATION)
 }
 
-/// A reader's error, which may repeat what it found in the file.
-fn said(error: impl std::fmt::Display) -> String {
-    shown(&error.to_string())
+/// A reader's message, which may repeat what it found in the file.
+fn said(message: String) -> String {
+    shown(&message)
 }
 
-fn open_hdf5(bytes: Vec<u8>) -> Result<Hdf5File, String> {
-    let len = bytes.len();
-    let options = OpenOptions::default()
-        .with_max_read_bytes(inflated(len))
-        .with_max_chunk_bytes(inflated(len))
-        .with_max_object_header_bytes(len)
-        .with_chunk_cache_bytes(0);
+fn open_hdf5(bytes: Vec<u8>) -> Result<Group, String> {
     let neither = "is neither an HDF5 file nor the zip archive of Keras 3, or is damaged";
-    Hdf5File::from_vec_with_options(bytes, options).map_err(|e| format!("{neither}: {}", said(e)))
-}
-
-fn root(file: &Hdf5File) -> Result<Group, String> {
-    file.root_group().map_err(|e| format!("is damaged: {}", said(e)))
+    hdf5::open(bytes).map_err(|message| format!("{neither}: {}", said(message)))
 }
 
 /// The strings of attribute `name`; of `name0`, `name1`, … where Keras had to split a long list.
@@ -149,9 +134,7 @@ fn list(attribute: &Attribute) -> Result<Vec<String>, String> {
     if attribute.shape.contains(&0) {
         return Ok(Vec::new());
     }
-    attribute
-        .read_strings()
-        .map_err(|e| format!("attribute `{}` is no list of names: {}", shown(&attribute.name), said(e)))
+    attribute.strings().map_err(|e| format!("attribute `{}` is no list of names: {}", shown(&attribute.name), said(e)))
 }
 
 /// The tensors of a file, by layer.
@@ -275,12 +258,7 @@ impl Tensor {
 
     /// The numbers, row-major; all of them finite.
     pub fn read(&self) -> Result<Vec<f32>, String> {
-        let values = self.dataset.read_array::<f32>().map(|array| array.into_iter().collect::<Vec<f32>>());
-        let values = values.or_else(|first| {
-            let wide = self.dataset.read_array::<f64>();
-            wide.map(|array| array.into_iter().map(|value| value as f32).collect()).map_err(|_| first)
-        });
-        let values = values.map_err(|e| format!("tensor `{}`: {}", self.name, said(e)))?;
+        let values = self.dataset.read().map_err(|message| format!("tensor `{}`: {}", self.name, said(message)))?;
         match values.iter().position(|value| !value.is_finite()) {
             Some(place) => Err(format!("tensor `{}` has {} at place {place}", self.name, values[place])),
             None => Ok(values),

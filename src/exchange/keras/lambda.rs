@@ -4,8 +4,7 @@
 //! the stack lie constants and expressions `factor · x + offset`. Any instruction that leads away from these, or that is not
 //! known, makes the function unknown, and the user has to say what it computes.
 
-use base64::Engine as _;
-use base64::engine::general_purpose::STANDARD;
+use data_encoding::BASE64;
 use serde_json::Value;
 
 use super::marshal::{self, Layout, Object};
@@ -49,7 +48,7 @@ pub(super) fn function(config: &serde_json::Map<String, Value>) -> Result<Lambda
 /// The bytes of marshalled code: Keras 1 wrote them as characters (Python's `raw_unicode_escape`), its successors in Base64.
 fn code_bytes(text: &str) -> Vec<u8> {
     let packed: String = text.chars().filter(|c| !c.is_ascii_whitespace()).collect();
-    if let Ok(bytes) = STANDARD.decode(packed)
+    if let Ok(bytes) = BASE64.decode(packed.as_bytes())
         && bytes.first().is_some_and(|kind| kind & 0x7f == b'c')
     {
         return bytes;
@@ -320,7 +319,7 @@ mod tests {
         let expected = LambdaAffine { factor: 1.0 / 127.5, offset: -1.0 };
         let characters: String = code.iter().map(|byte| char::from(*byte)).collect();
         let keras1 = json!({"function": [characters, null, null], "arguments": {}});
-        let mut lines = STANDARD.encode(&code);
+        let mut lines = BASE64.encode(&code);
         lines.insert(40, '\n');
         let keras3 = json!({"function": {"class_name": "__lambda__", "config": {"code": lines, "defaults": null}}});
         for config in [keras1, keras3] {

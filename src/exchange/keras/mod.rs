@@ -10,6 +10,7 @@
 mod architecture;
 mod assemble;
 mod file;
+mod hdf5;
 mod lambda;
 mod limits;
 mod marshal;

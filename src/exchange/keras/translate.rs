@@ -424,6 +424,17 @@ mod tests {
     }
 
     #[test]
+    fn swish_is_read_by_both_its_names_as_a_layer_and_as_an_option() {
+        for name in ["swish", "silu"] {
+            for (class, option) in [("Activation", json!(name)), ("Dense", json!({"class_name": "f", "config": name}))]
+            {
+                let step = step(class, json!({"units": 3, "activation": option}));
+                assert_eq!(step.activation, Some(SwishSpec {}.into()), "{class} {name}");
+            }
+        }
+    }
+
+    #[test]
     fn borders_are_read_in_every_spelling() {
         let expected = Operation::Plain(ZeroPadSpec { rows: [1, 1], columns: [2, 2] }.into());
         for padding in [json!([1, 2]), json!([1, 1, 2, 2]), json!([[1, 1], [2, 2]])] {

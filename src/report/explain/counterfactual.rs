@@ -80,10 +80,10 @@ pub fn examine(
     let look = |(pilot, buffers, image, changed): &mut (Pilot, FootageBuffers, RgbImage, RgbImage), i: usize| {
         footage.picture(i, buffers, image)?;
         let mut answers = [0.0f32; Change::ALL.len() + 1];
-        answers[0] = pilot.steer(image.height, image.width, &image.pixels)?;
+        answers[0] = pilot.steer(image.view())?;
         for (change, answer) in Change::ALL.into_iter().zip(&mut answers[1..]) {
             change.apply(image, changed);
-            *answer = pilot.steer(changed.height, changed.width, &changed.pixels)?;
+            *answer = pilot.steer(changed.view())?;
         }
         tally.add(1)?;
         Ok(answers)

@@ -60,7 +60,7 @@ pub fn exhibits(pilot: &Pilot, footage: &Footage, steering: &[f32]) -> Result<Ex
     let mut salient = Vec::new();
     for (k, &i) in chosen.iter().enumerate() {
         footage.picture(i, &mut buffers, &mut image)?;
-        let answer = saliency.steer(&mut pilot, image.height, image.width, &image.pixels)?;
+        let answer = saliency.steer(&mut pilot, image.view())?;
         let mut picture = image.clone();
         saliency.overlay(&pilot.recipe().preprocessing, &mut picture);
         let mut caption = format!("{}\nmodel {:+.1}°", footage.name(i), degrees(answer));
@@ -83,7 +83,7 @@ pub fn exhibits(pilot: &Pilot, footage: &Footage, steering: &[f32]) -> Result<Ex
     for (k, change) in Change::ALL.into_iter().enumerate() {
         let mut picture = RgbImage::default();
         change.apply(&image, &mut picture);
-        let answer = pilot.steer(picture.height, picture.width, &picture.pixels)?;
+        let answer = pilot.steer(picture.view())?;
         let caption = format!("{}: {:+.1}°", change.text(), degrees(answer));
         changes.push(Exhibit { name: format!("change_{:02}", k + 1), picture, caption });
     }
@@ -120,9 +120,7 @@ fn filters(pilot: &Pilot) -> Option<Exhibit> {
 /// The feature maps of each convolution, after its activation.
 fn features(pilot: &mut Pilot, image: &RgbImage) -> Result<Vec<Exhibit>> {
     let mut seen: Vec<(usize, Vec<f32>)> = Vec::new();
-    pilot.steer_observed(image.height, image.width, &image.pixels, &mut |layer, output| {
-        seen.push((layer, output.to_vec()))
-    })?;
+    pilot.steer_observed(image.view(), &mut |layer, output| seen.push((layer, output.to_vec())))?;
     let layers = pilot.network().layers();
     let mut exhibits = Vec::new();
     for (index, layer) in layers.iter().enumerate() {

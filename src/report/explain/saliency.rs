@@ -8,6 +8,8 @@
 //!
 //! It shows what *excites* the layers, not what the steering depends on: that is what [`crate::report::explain::counterfactual`] measures.
 
+use ndarray::ArrayView3;
+
 use crate::dataset::preprocess::Preprocessing;
 use crate::engine::layers::{Family, ReceptiveField};
 use crate::engine::network::Network;
@@ -139,9 +141,9 @@ impl Saliency {
     /// # Errors
     ///
     /// As [`Pilot::steer`].
-    pub fn steer(&mut self, pilot: &mut Pilot, height: usize, width: usize, rgb: &[u8]) -> Result<f32> {
+    pub fn steer(&mut self, pilot: &mut Pilot, image: ArrayView3<u8>) -> Result<f32> {
         let means = &mut self.means;
-        let steering = pilot.steer_observed(height, width, rgb, &mut |layer, output| {
+        let steering = pilot.steer_observed(image, &mut |layer, output| {
             if let Some(mean) = means.iter_mut().find(|mean| mean.layer == layer) {
                 mean.take(output);
             }
@@ -255,6 +257,8 @@ impl SpreadAxis {
 
 #[cfg(test)]
 mod tests {
+    use ndarray::Array3;
+
     use super::*;
     use crate::model_file::{Model, TrainingRecord};
     use crate::recipe::{Recipe, SHIPPED};
@@ -304,8 +308,9 @@ mod tests {
         Pilot::new(model, Isa::best()).unwrap()
     }
 
-    fn picture() -> Vec<u8> {
-        (0..160 * 320 * 3usize).map(|i| (i.wrapping_mul(2_654_435_761) >> 13) as u8).collect()
+    fn picture() -> Array3<u8> {
+        let bytes = (0..160 * 320 * 3usize).map(|i| (i.wrapping_mul(2_654_435_761) >> 13) as u8).collect();
+        Array3::from_shape_vec((160, 320, 3), bytes).unwrap()
     }
 
     #[test]
@@ -313,10 +318,9 @@ mod tests {
         let mut pilot = pilot("lenet");
         let mut saliency = Saliency::new(pilot.network()).unwrap();
         let mut seen = Vec::new();
-        let steering = pilot
-            .steer_observed(160, 320, &picture(), &mut |layer, output| seen.push((layer, output.to_vec())))
-            .unwrap();
-        assert_eq!(saliency.steer(&mut pilot, 160, 320, &picture()).unwrap(), steering);
+        let steering =
+            pilot.steer_observed(picture().view(), &mut |layer, output| seen.push((layer, output.to_vec()))).unwrap();
+        assert_eq!(saliency.steer(&mut pilot, picture().view()).unwrap(), steering);
         // Layers: scale, conv 3x3, ELU, pool 4x4, conv 3x3, ELU, pool, …
         let mean = |layer: usize, positions: usize| -> Vec<f32> {
             let output = &seen.iter().find(|(index, _)| *index == layer).unwrap().1;
@@ -344,12 +348,12 @@ mod tests {
         for (name, _) in SHIPPED {
             let mut pilot = pilot(name);
             let mut saliency = Saliency::new(pilot.network()).unwrap();
-            let before = pilot.steer(160, 320, &picture()).unwrap();
-            assert_eq!(saliency.steer(&mut pilot, 160, 320, &picture()).unwrap(), before, "{name}");
+            let before = pilot.steer(picture().view()).unwrap();
+            assert_eq!(saliency.steer(&mut pilot, picture().view()).unwrap(), before, "{name}");
             let [h, w] = saliency.size();
             assert_eq!(saliency.map().len(), h * w, "{name}");
             assert!(saliency.map().iter().all(|v| (0.0..=1.0).contains(v)) && saliency.map().contains(&1.0), "{name}");
-            let original = RgbImage { height: 160, width: 320, pixels: picture() };
+            let original = RgbImage { height: 160, width: 320, pixels: picture().into_raw_vec_and_offset().0 };
             let mut image = original.clone();
             saliency.overlay(&pilot.recipe().preprocessing, &mut image);
             let first = pilot.recipe().preprocessing.rows[0] * 320 * 3;

@@ -4,17 +4,15 @@ use std::fs::File;
 use std::io::BufWriter;
 use std::path::Path;
 
-use mp4::{AvcConfig, MediaConfig, Mp4Config, Mp4Sample, Mp4Writer, TrackConfig, TrackType};
 use rusty_h264_common::{Profile, YuvPlanes};
 use rusty_h264_encoder::{Encoder, EncoderConfig, Preset};
 
+use super::mp4::{Mp4Writer, TICKS_PER_S, TrackHeader};
 use super::summary::VideoSummary;
 use crate::error::{Error, Result};
 use crate::files::atomic_file::NewFile;
 use crate::picture::RgbImage;
 
-/// Ticks of the file's clock in a second.
-const TICKS_PER_S: u32 = 90_000;
 /// Seconds between pictures that stand alone, to which a player can jump.
 const KEY_S: f64 = 2.0;
 /// Quantizer, 0 (best) to 51: text stays crisp, and two minutes of the simulator take 15 to 18 MB.
@@ -97,18 +95,18 @@ impl VideoFile {
             .map_err(|e| Error::Codec(format!("picture {} cannot be encoded: {e}", self.frames)))?;
         let unit = AccessUnit::parse(&unit);
         if self.muxer.is_none() {
-            let opened = begin(BufWriter::new(self.place.open()?), self.size, &unit);
-            self.muxer = Some(opened.map_err(|e| self.explain(e))?);
+            let header = TrackHeader {
+                width: width as u16,
+                height: height as u16,
+                sequence: unit.sequence,
+                picture: unit.picture,
+                ticks_per_frame: self.ticks_per_frame,
+            };
+            let opened = Mp4Writer::begin(BufWriter::new(self.place.open()?), header);
+            self.muxer = Some(opened.map_err(|e| self.place.explain(e))?);
         }
-        let sample = Mp4Sample {
-            start_time: self.frames * u64::from(self.ticks_per_frame),
-            duration: self.ticks_per_frame,
-            rendering_offset: 0,
-            is_sync: unit.stands_alone,
-            bytes: unit.sample.into(),
-        };
-        let written = self.muxer.as_mut().map_or(Ok(()), |muxer| muxer.write_sample(1, &sample));
-        written.map_err(|e| self.explain(e))?;
+        let written = self.muxer.as_mut().map_or(Ok(()), |muxer| muxer.write(&unit.sample, unit.stands_alone));
+        written.map_err(|e| self.place.explain(e))?;
         self.frames += 1;
         Ok(())
     }
@@ -120,21 +118,13 @@ impl VideoFile {
     /// [`Error::Input`] if there is no picture, [`Error::Usage`] if another program has created the file, [`Error::CannotWrite`] if
     /// the disk is full, [`Error::Io`] if it cannot be written.
     pub fn finish(mut self) -> Result<VideoSummary> {
-        let Some(mut muxer) = self.muxer.take() else {
+        let Some(muxer) = self.muxer.take() else {
             return Err(Error::Input("a video without a picture is not written".into()));
         };
-        muxer.write_end().map_err(|e| self.explain(e))?;
-        muxer.into_writer().into_inner().map_err(|e| self.place.explain(e.into_error()))?;
+        muxer.finish().map_err(|e| self.place.explain(e))?;
         let (frames, fps) = (self.frames, self.fps());
         let bytes = self.place.finish()?;
         Ok(VideoSummary { frames, fps, seconds: frames as f64 / fps, bytes, unreadable: 0 })
-    }
-
-    fn explain(&self, error: mp4::Error) -> Error {
-        match error {
-            mp4::Error::IoError(source) => self.place.explain(source),
-            other => Error::Codec(format!("the video cannot be written: {other}")),
-        }
     }
 }
 
@@ -156,33 +146,6 @@ fn check_fps(fps: f64) -> Result<()> {
         true => Ok(()),
         false => Err(Error::Usage(format!("{fps} pictures a second: {} to {} can be written", FPS.start(), FPS.end()))),
     }
-}
-
-fn begin<W: std::io::Write + std::io::Seek>(
-    out: W,
-    [height, width]: [usize; 2],
-    first: &AccessUnit,
-) -> mp4::Result<Mp4Writer<W>> {
-    let brands = [*b"isom", *b"iso2", *b"avc1", *b"mp41"];
-    let config = Mp4Config {
-        major_brand: (*b"isom").into(),
-        minor_version: 512,
-        compatible_brands: brands.map(Into::into).to_vec(),
-        timescale: TICKS_PER_S,
-    };
-    let mut muxer = Mp4Writer::write_start(out, &config)?;
-    muxer.add_track(&TrackConfig {
-        track_type: TrackType::Video,
-        timescale: TICKS_PER_S,
-        language: "und".into(),
-        media_conf: MediaConfig::AvcConfig(AvcConfig {
-            width: width as u16,
-            height: height as u16,
-            seq_param_set: first.sequence.clone(),
-            pic_param_set: first.picture.clone(),
-        }),
-    })?;
-    Ok(muxer)
 }
 
 /// One coded picture, taken apart as MP4 wants it (ISO/IEC 14496-15): parameter sets for the header, and the slices, each
@@ -298,39 +261,6 @@ mod tests {
         ] {
             let close = levels(rgb).iter().zip(expected).all(|(a, b): (&u8, u8)| a.abs_diff(b) <= 1);
             assert!(close, "{rgb:?} {:?}", levels(rgb));
-        }
-    }
-
-    #[test]
-    fn a_video_can_be_read_again_with_its_pictures_times_and_places_to_jump_to() {
-        let scratch = tempfile::tempdir().unwrap();
-        let path = scratch.path().join("a.mp4");
-        let mut video = VideoFile::create(&path, [96, 128], 10.0).unwrap();
-        for k in 0..45 {
-            video.write(&RgbImage::from_fn(96, 128, |row, column| [(row + 3 * k) as u8, column as u8, 90])).unwrap();
-        }
-        assert!(!path.exists());
-        let summary = video.finish().unwrap();
-        let file = File::open(&path).unwrap();
-        let size = file.metadata().unwrap().len();
-        assert_eq!((summary.frames, summary.fps, summary.seconds, summary.bytes), (45, 10.0, 4.5, size));
-        let mut reader = mp4::Mp4Reader::read_header(std::io::BufReader::new(file), size).unwrap();
-        assert_eq!(reader.duration().as_millis(), 4500);
-        let track = &reader.tracks()[&1];
-        assert_eq!((track.width(), track.height(), track.sample_count()), (128, 96, 45));
-        assert_eq!(track.media_type().unwrap(), mp4::MediaType::H264);
-        assert_eq!(track.video_profile().unwrap(), mp4::AvcProfile::AvcMain);
-        let samples: Vec<Mp4Sample> = (1..=45).map(|id| reader.read_sample(1, id).unwrap().unwrap()).collect();
-        assert!(samples.iter().enumerate().all(|(k, s)| s.start_time == 9000 * k as u64 && s.duration == 9000));
-        let keys: Vec<usize> = (0..45).filter(|k| samples[*k].is_sync).collect();
-        assert_eq!(keys, [0, 20, 40]);
-        // Lengths lead from unit to unit to the end.
-        for sample in &samples {
-            let mut rest = &sample.bytes[..];
-            while let Some((length, tail)) = rest.split_first_chunk::<4>() {
-                rest = &tail[u32::from_be_bytes(*length) as usize..];
-            }
-            assert!(rest.is_empty() && !sample.bytes.is_empty());
         }
     }
 

@@ -8,6 +8,7 @@ pub mod drive;
 pub mod file;
 pub mod film;
 mod lettering;
+mod mp4;
 pub mod onlooker;
 pub mod painter;
 pub mod recording;

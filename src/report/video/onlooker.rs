@@ -43,10 +43,10 @@ impl Onlooker {
     pub fn look(&mut self, picture: &mut RgbImage) -> Result<(f64, Duration)> {
         let Onlooker { pilot, saliency } = self;
         let asked = Instant::now();
-        let steering = pilot.steer(picture.height, picture.width, &picture.pixels)?;
+        let steering = pilot.steer(picture.view())?;
         let answered_in = asked.elapsed();
         if let Some(saliency) = saliency {
-            saliency.steer(pilot, picture.height, picture.width, &picture.pixels)?;
+            saliency.steer(pilot, picture.view())?;
             saliency.overlay(&pilot.recipe().preprocessing, picture);
         }
         Ok((f64::from(steering) * pilot.recipe().full_lock_deg, answered_in))

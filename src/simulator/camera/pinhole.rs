@@ -1,5 +1,7 @@
 //! The cameras of Udacity's car: where they sit, where they look, and which pixel shows which point.
 
+use ndarray::ArrayView3;
+
 use crate::simulator::car::pose::BodyPose;
 use crate::simulator::math::{Vec3, sin_cos, vec3};
 
@@ -20,6 +22,17 @@ pub struct RgbFrame {
 impl Default for RgbFrame {
     fn default() -> Self {
         RgbFrame { pixels: vec![0; WIDTH * HEIGHT * 3] }
+    }
+}
+
+impl RgbFrame {
+    /// The pixels as an array, `(HEIGHT, WIDTH, 3)`.
+    ///
+    /// # Panics
+    ///
+    /// Panics if there are not `HEIGHT · WIDTH · 3` bytes of them.
+    pub fn view(&self) -> ArrayView3<'_, u8> {
+        ArrayView3::from_shape((HEIGHT, WIDTH, 3), &self.pixels).expect("HEIGHT · WIDTH · 3 bytes")
     }
 }
 

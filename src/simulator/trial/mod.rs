@@ -5,6 +5,7 @@ pub mod drive;
 pub mod driver;
 pub mod event;
 pub mod outcome;
+mod pilot;
 pub mod run;
 pub mod statistics;
 pub mod summary;

@@ -1,23 +1,29 @@
-//! Which layers run as one.
+//! Fusion: which neighbouring layers run as one stage.
 //!
 //! | layers | run as | because |
 //! |---|---|---|
 //! | batch norm, ReLU or PReLU, then max pool 2x2 if there is one, after a convolution or dense layer | [`NormRectify`] | one pass over the maps instead of three, and nothing between is written; the gradient of the convolution's output takes its place |
 //! | convolution of stride 1 without padding, ReLU or ELU, max pool 4x4 | [`PooledConv`] | the activation of a 16th of the values; gradients from a 16th of the positions |
 //!
-//! Everything else runs layer by layer, frozen batch norm too. What runs as one computes the same as its layers, up to rounding.
+//! Every other layer is a stage by itself, frozen batch norm too. A fused stage computes what its layers compute one by one, up to
+//! rounding.
+
+mod norm_rectify;
+mod pooled_conv;
 
 use std::ops::Range;
 
+use norm_rectify::NormRectify;
+use pooled_conv::{MonotonicActivation, PooledConv};
+
 use super::{LayerSpec, NamedLayer, Network};
 use crate::engine::layers::{
-    BatchNorm, BatchNormSpec, BatchStatistics, Conv2d, Conv2dSpec, EluSpec, MaxPoolSpec, NormRectify, PReluSpec,
-    Packing, PooledConv, Rising, Slopes,
+    BatchNorm, BatchNormSpec, BatchStatistics, Conv2d, Conv2dSpec, EluSpec, MaxPoolSpec, PReluSpec, Packing, Slopes,
 };
 
-/// Neighbouring layers that run as one.
+/// Neighbouring layers that run as one; most stages are a single layer.
 #[derive(Clone, Debug)]
-pub(super) struct Stage {
+pub(in crate::engine::network) struct FusedStage {
     /// Which layers.
     pub layers: Range<usize>,
     pub kind: Kind,
@@ -27,15 +33,15 @@ pub(super) struct Stage {
 
 /// How a stage runs.
 #[derive(Clone, Debug)]
-pub(super) enum Kind {
+pub(in crate::engine::network) enum Kind {
     /// A single layer, as it is.
     Layer,
     NormRectify(NormRectify),
     PooledConv(Box<PooledConv>),
 }
 
-impl Stage {
-    /// The barrier of a stage that needs one: frozen layers go by their running statistics.
+impl FusedStage {
+    /// The barrier of a stage that needs one. A frozen layer takes its running statistics and needs none.
     pub fn barrier<'a>(&'a self, network: &'a Network) -> Option<&'a dyn BatchStatistics> {
         self.batch_statistics(network).filter(|_| !network.layers()[self.layers.start].frozen)
     }
@@ -67,7 +73,7 @@ impl Stage {
         network.layers()[self.layers.end - 1].layer.output().len()
     }
 
-    /// How many numbers of scratch its passes need for `n` images.
+    /// Length of the scratch buffer that its passes need for `n` images.
     pub fn scratch_len(&self, network: &Network, n: usize) -> usize {
         match &self.kind {
             Kind::Layer => network.layers()[self.layers.start].layer.scratch_len(n),
@@ -85,8 +91,8 @@ impl Stage {
         }
     }
 
-    /// How many places of largest values an image has.
-    pub fn places_len(&self, network: &Network) -> usize {
+    /// Length of an image's argmax indices.
+    pub fn argmax_len(&self, network: &Network) -> usize {
         if let Kind::PooledConv(_) = self.kind { self.output_len(network) } else { 0 }
     }
 
@@ -101,9 +107,9 @@ impl Stage {
 }
 
 /// The stages of a network, in order; views are left out.
-pub(super) fn stages(network: &Network) -> Vec<Stage> {
+pub(in crate::engine::network) fn stages(network: &Network) -> Vec<FusedStage> {
     let layers = network.layers();
-    let mut stages: Vec<Stage> = Vec::new();
+    let mut stages: Vec<FusedStage> = Vec::new();
     let mut next = 0;
     while next < layers.len() {
         let source = stages.len().checked_sub(1);
@@ -118,14 +124,14 @@ pub(super) fn stages(network: &Network) -> Vec<Stage> {
             _ => pooled_conv(network, &layers[next..]).map(|fused| (3, Kind::PooledConv(Box::new(fused)))),
         };
         let (count, kind) = fused.unwrap_or((1, Kind::Layer));
-        stages.push(Stage { layers: next..next + count, kind, source });
+        stages.push(FusedStage { layers: next..next + count, kind, source });
         next += count;
     }
     stages
 }
 
 /// Whether the gradient of the stage's input takes the place of that input.
-pub(super) fn replaces_input(network: &Network, stages: &[Stage], index: usize) -> bool {
+pub(in crate::engine::network) fn replaces_input(network: &Network, stages: &[FusedStage], index: usize) -> bool {
     let Some(source) = stages[index].source else { return false };
     match &stages[index].kind {
         Kind::NormRectify(_) => true,
@@ -137,10 +143,10 @@ pub(super) fn replaces_input(network: &Network, stages: &[Stage], index: usize) 
     }
 }
 
-/// The layers at the start of `layers` that a [`NormRectify`] stands for, and how many they are.
+/// The [`NormRectify`] that computes the first of `layers`, and how many of them it computes.
 fn norm_rectify(network: &Network, layers: &[NamedLayer]) -> Option<(usize, NormRectify)> {
     let LayerSpec::BatchNorm(BatchNormSpec { epsilon, running_old_weight }) = layers.first()?.spec else { return None };
-    // It takes the gradients of its slopes at the barrier, which frozen batch norm has not.
+    // The gradients of the slopes are computed at the barrier, and frozen batch norm has no barrier.
     if layers[0].frozen {
         return None;
     }
@@ -156,19 +162,19 @@ fn norm_rectify(network: &Network, layers: &[NamedLayer]) -> Option<(usize, Norm
         _ => false,
     };
     let shape = layers[0].layer.input();
-    // Units of a dense layer are channels of one position, which planes are no help for; a slope each is a slope a channel.
+    // After a dense layer each unit is a channel of one position, so one slope per position is one slope per channel.
     let slopes = slopes.map(|slopes| if shape.positions() == 1 { Slopes::PerChannel } else { slopes });
     let norm = BatchNorm::new(shape, epsilon, running_old_weight, network.isa()).ok()?;
     Some((if pooled { 3 } else { 2 }, NormRectify::new(norm, slopes, pooled, network.isa())))
 }
 
-/// What stands for the first three of `layers`, if a [`PooledConv`] does.
+/// The [`PooledConv`] that computes the first three of `layers`, if they are such layers.
 fn pooled_conv(network: &Network, layers: &[NamedLayer]) -> Option<PooledConv> {
     let [conv, activation, pool, ..] = layers else { return None };
     let LayerSpec::Conv2d(Conv2dSpec { filters, kernel, stride, padding, init }) = conv.spec else { return None };
     let activation = match activation.spec {
-        LayerSpec::Relu(_) => Rising::Relu,
-        LayerSpec::Elu(EluSpec { alpha }) => Rising::Elu(alpha),
+        LayerSpec::Relu(_) => MonotonicActivation::Relu,
+        LayerSpec::Elu(EluSpec { alpha }) => MonotonicActivation::Elu(alpha),
         _ => return None,
     };
     let LayerSpec::MaxPool(MaxPoolSpec { window: [4, 4], stride: None | Some([4, 4]) }) = pool.spec else {
@@ -181,6 +187,7 @@ fn pooled_conv(network: &Network, layers: &[NamedLayer]) -> Option<PooledConv> {
 
 #[cfg(test)]
 mod tests {
+    use ndarray::{ArrayView1, ArrayView4};
     use steersman_kernels::Isa;
 
     use super::super::training::{GROUP_LIMITS, GroupLimits};
@@ -195,9 +202,9 @@ mod tests {
         layers: Vec<LayerSpec>,
     }
 
-    fn layer_by_layer(network: &Network) -> Vec<Stage> {
+    fn layer_by_layer(network: &Network) -> Vec<FusedStage> {
         let computes = (0..network.layers().len()).filter(|&layer| !network.layers()[layer].layer.is_view());
-        let stage = |(index, layer): (usize, usize)| Stage {
+        let stage = |(index, layer): (usize, usize)| FusedStage {
             layers: layer..layer + 1,
             kind: Kind::Layer,
             source: index.checked_sub(1),
@@ -206,7 +213,12 @@ mod tests {
     }
 
     /// Loss, gradient and parameters after a step.
-    fn step(network: &Network, stages: Vec<Stage>, images: usize, limits: GroupLimits) -> (f64, Vec<f32>, Parameters) {
+    fn step(
+        network: &Network,
+        stages: Vec<FusedStage>,
+        images: usize,
+        limits: GroupLimits,
+    ) -> (f64, Vec<f32>, Parameters) {
         let mut random = rng(3, Purpose::Test, 0, 0);
         let mut draw = |len: usize| (0..len).map(|_| uniform(&mut random, -1.0, 1.0) as f32).collect::<Vec<f32>>();
         let (x, labels) = (draw(images * network.input().len()), draw(images));
@@ -215,7 +227,8 @@ mod tests {
         parameters.values.iter_mut().zip(draw(network.count(true))).for_each(|(p, d)| *p += 0.2 * d);
         parameters.statistics.iter_mut().zip(draw(network.count(false))).for_each(|(p, d)| *p += 0.2 * d);
         let mut plan = TrainingPlan::with_stages(network, images, stages, limits);
-        let input = StepInput { x: &x, labels: &labels, seed: 1, step: 0 };
+        let x = ArrayView4::from_shape(network.input().batch(images), &x).unwrap();
+        let input = StepInput { x, labels: ArrayView1::from(&labels), seed: 1, step: 0 };
         let loss = plan.step(network, &mut parameters, &Loss::default(), input);
         (loss, plan.gradient().to_vec(), parameters)
     }

@@ -3,12 +3,13 @@
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
+use ndarray::ArrayView1;
 use serde::{Deserialize, Serialize};
 use steersman_kernels::conv::ConvAlgorithm;
 use steersman_kernels::{Backend, Isa};
 
 use super::checkpoint::{Progress, State};
-use super::data::Data;
+use super::data::{Data, images};
 use super::history::EpochRecord;
 use super::profile::{Profile, ProfileReport};
 use super::run_folder::{RunFolder, RunInfo, RunLock};
@@ -16,7 +17,7 @@ use super::transfer::{Start, TransferRequest};
 use super::validation::{Validation, ValidationResult};
 use crate::dataset::held_out::held_out_tracks;
 use crate::dataset::loader::{Batch, Loader};
-use crate::engine::network::{Network, StepInput, TrainingPlan};
+use crate::engine::network::{Network, Parameters, StepInput, TrainingPlan};
 use crate::engine::optimizer::Optimizer;
 use crate::engine::stopwatch::Stopwatch;
 use crate::error::{Error, Result};
@@ -26,8 +27,8 @@ use crate::model_file::{Model, TrainingRecord, weights_hash};
 use crate::observer::{Observer, StopSignal};
 use crate::recipe::{Keep, Recipe};
 
-/// Most images of one row: three cameras, each mirrored. A batch of whole rows has at least one row.
-const IMAGES_OF_A_ROW: usize = 6;
+/// Maximum of images of one row: three cameras, each mirrored. A batch of whole rows has at least one row.
+const MAX_ROW_IMAGES: usize = 6;
 
 /// What to train on, and how.
 #[derive(Clone, Debug)]
@@ -75,7 +76,7 @@ pub enum TrainingEvent {
     },
 }
 
-/// What a run came to; `train --json` prints it.
+/// The result of a run; `train --json` prints it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TrainResult {
@@ -161,8 +162,8 @@ pub fn train(
     }
     data.write_split(&folder.file("split.csv"))?;
     folder.write_json("run.json", &info)?;
-    let session = Session::new((folder, lock), info, recipe, data, start, started)?;
-    session.measured(profile).run(observer, stop)
+    let run = TrainingRun::new((folder, lock), info, recipe, data, start, started)?;
+    run.measured(profile).run(observer, stop)
 }
 
 /// Goes on with the run in `path`, as if it had never stopped; returns the result again if it is finished. With `profile` the
@@ -207,12 +208,12 @@ pub fn resume(
     }
     let from = info.transfer.as_ref().map(TransferRequest::of);
     let start = from.map(|from| Start::load(&folder.from(), &from, &recipe, info.seed)).transpose()?;
-    let mut session = Session::new((folder, lock), info, recipe, data, start, started)?;
-    session.restore()?;
-    session.measured(profile).run(observer, stop)
+    let mut run = TrainingRun::new((folder, lock), info, recipe, data, start, started)?;
+    run.restore()?;
+    run.measured(profile).run(observer, stop)
 }
 
-struct Session {
+struct TrainingRun {
     folder: RunFolder,
     /// Held until the end of the run.
     _lock: RunLock,
@@ -230,7 +231,7 @@ struct Session {
     profile: Option<Profile>,
 }
 
-impl Session {
+impl TrainingRun {
     fn new(
         (folder, lock): (RunFolder, RunLock),
         info: RunInfo,
@@ -238,12 +239,12 @@ impl Session {
         data: Data,
         start: Option<Start>,
         started: Instant,
-    ) -> Result<Session> {
+    ) -> Result<TrainingRun> {
         let mut network = recipe.network(Backend { isa: Isa::best(), conv: info.conv_algorithm(&folder)? })?;
         if let Some(start) = &start {
             network.freeze(&start.transfer.frozen)?;
         }
-        let optimizer = Optimizer::new(recipe.optimizer, recipe.clip_gradient_norm, &network);
+        let optimizer = Optimizer::new(recipe.optimizer, recipe.clip_gradient_norm, network.tensors(), network.isa());
         let (leak_percent, mut training_rows) = (data.leak_percent(), data.training_row_ids());
         let mut notices = data.notices().to_vec();
         let parameters = match start {
@@ -259,8 +260,8 @@ impl Session {
         let (training, validation) = data.into_loaders()?;
         // No batch is larger than a side has samples, whatever the recipe asks for.
         let most = training.samples().max(validation.as_ref().map_or(0, Loader::samples));
-        let capacity = recipe.batch.min(most).max(IMAGES_OF_A_ROW);
-        Ok(Session {
+        let capacity = recipe.batch.min(most).max(MAX_ROW_IMAGES);
+        Ok(TrainingRun {
             plan: TrainingPlan::new(&network, capacity),
             validation: validation.map(|loader| Validation::new(loader, &network, capacity, recipe.full_lock_deg)),
             state: State { parameters, optimizer, best: None, progress: Progress::default() },
@@ -278,8 +279,8 @@ impl Session {
         })
     }
 
-    /// The session, with `profile` measuring what it does from now on.
-    fn measured(mut self, profile: Option<Profile>) -> Session {
+    /// The run, with `profile` measuring what it does from now on.
+    fn measured(mut self, profile: Option<Profile>) -> TrainingRun {
         if let Some(profile) = &profile {
             self.training.measure(&profile.loading);
             self.plan.measure(profile.update.clone());
@@ -288,10 +289,10 @@ impl Session {
                 validation.measure(&profile.loading, profile.evaluation.clone());
             }
         }
-        Session { profile, ..self }
+        TrainingRun { profile, ..self }
     }
 
-    /// Takes the state over from the last checkpoint, if there is one.
+    /// Restores the state of the last checkpoint, if there is one.
     fn restore(&mut self) -> Result<()> {
         let path = self.folder.file("checkpoint.safetensors");
         if path.is_file() {
@@ -338,7 +339,7 @@ impl Session {
         self.finish()
     }
 
-    /// Trains the rest of the epoch under way.
+    /// Trains on the remaining batches of the current epoch.
     fn train_epoch(
         &mut self,
         [current, next]: &mut [Batch; 2],
@@ -363,13 +364,14 @@ impl Session {
             let step = u64::from(epoch) * batches as u64 + batch as u64;
             let State { parameters, optimizer, progress, .. } = &mut self.state;
             let (network, plan, loss) = (&self.network, &mut self.plan, &self.recipe.loss);
-            // While the network learns from one batch, the next one is prepared.
+            // The next batch is loaded while the network trains on this one.
             let ((mean_loss, step_done), filled) = rayon::join(
                 || {
                     if current.n == 0 {
                         return (0.0, Instant::now());
                     }
-                    let input = StepInput { x: &current.x, labels: &current.labels, seed: self.info.seed, step };
+                    let (x, labels) = (images(network.input(), current), ArrayView1::from(&current.labels));
+                    let input = StepInput { x, labels, seed: self.info.seed, step };
                     (plan.step(network, parameters, loss, input), Instant::now())
                 },
                 || if following < batches { training.fill(following, next) } else { Ok(()) },
@@ -431,7 +433,7 @@ impl Session {
         progress.epoch += 1;
         (progress.next_batch, progress.loss_sum, progress.images, progress.train_seconds) = (0, 0.0, 0, 0.0);
 
-        // Without a validation side the latest weights are the best there are; so they are if the recipe says so.
+        // Without a validation side, or with `keep = "last"`, the latest weights count as the best.
         let better = match (record.val_mse, progress.best_val_mse) {
             (Some(now), Some(before)) => now < before || self.recipe.keep == Keep::Last,
             _ => true,
@@ -499,7 +501,7 @@ impl Session {
         if let Some(best) = &self.state.best {
             let progress = &self.state.progress;
             self.model(best, progress.best_epoch).save(&folder.model())?;
-            // In the middle of an epoch the weights belong to no epoch's figures; the checkpoint has them.
+            // In the middle of an epoch the weights have no measures of their own; only the checkpoint stores them.
             if progress.next_batch == 0 {
                 self.model(&self.state.parameters, epoch).save(&folder.file("last.safetensors"))?;
             }
@@ -508,7 +510,7 @@ impl Session {
     }
 
     /// The weights after `epoch` (from 1) as a model.
-    fn model(&self, parameters: &crate::engine::network::Parameters, epoch: u32) -> Model {
+    fn model(&self, parameters: &Parameters, epoch: u32) -> Model {
         let record = self.state.progress.history[epoch as usize - 1];
         Model {
             recipe: self.recipe.clone(),
@@ -530,7 +532,7 @@ impl Session {
         }
     }
 
-    /// What is only known once every image has been decoded.
+    /// Reports what is known only after every image has been decoded: unreadable images and near twins.
     fn report_images(&self, observer: &mut dyn Observer<TrainingEvent>) -> Result<()> {
         let sides = [Some(self.training.undecodable()), self.validation.as_ref().map(Validation::undecodable)];
         for (count, examples) in sides.into_iter().flatten().filter(|(count, _)| *count > 0) {

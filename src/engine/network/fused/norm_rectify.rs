@@ -3,11 +3,10 @@
 use steersman_kernels::Isa;
 use steersman_kernels::norm_rectify::{self, ChannelMeans, ChannelStatistics, RectifyShape, Slopes as Rectifier};
 
-use super::batch_norm::Moments;
-use super::{BatchNorm, BatchStatistics, Layer, Pass, Slopes};
+use crate::engine::layers::{BatchNorm, BatchStatistics, Layer, Moments, Pass, Slopes};
 use crate::engine::tensor::Shape;
 
-/// What [`BatchNorm`], [`Relu`](super::Relu) or [`PRelu`](super::PRelu), and [`MaxPool`](super::MaxPool) of 2x2 windows do
+/// What [`BatchNorm`], [`Relu`](crate::engine::layers::Relu) or [`PRelu`](crate::engine::layers::PRelu), and [`MaxPool`](crate::engine::layers::MaxPool) of 2x2 windows do
 /// one after the other, in one pass over the maps. The normalised and the rectified maps are never written.
 ///
 /// Not a [`Layer`], for the gradient of the input takes the place of the input. Parameters are those of the layers, one
@@ -46,7 +45,7 @@ impl NormRectify {
         }
     }
 
-    /// How many numbers of scratch [`infer`](NormRectify::infer) needs.
+    /// Length of the scratch buffer of [`infer`](NormRectify::infer).
     pub fn scratch_len(&self) -> usize {
         2 * self.shape.c
     }

@@ -1,0 +1,56 @@
+//! The batch of one training step.
+
+use ndarray::{ArrayView1, ArrayView4};
+
+use super::Network;
+
+/// The batch of one training step.
+///
+/// Both arrays must be contiguous in standard (row-major) order: the step reads them where they lie, without a copy.
+#[derive(Clone, Copy, Debug)]
+pub struct StepInput<'a> {
+    /// Images, `(n, c, h, w)`.
+    pub x: ArrayView4<'a, f32>,
+    /// Labels, `(n)`; for a network with several outputs `(n · outputs)`, image by image.
+    pub labels: ArrayView1<'a, f32>,
+    /// Seed of the run (for dropout).
+    pub seed: u64,
+    /// Number of the step, from 0 (for dropout).
+    pub step: u64,
+}
+
+/// A [`StepInput`] whose shapes have been checked, as slices.
+#[derive(Clone, Copy)]
+pub(super) struct StepSlices<'a> {
+    /// `[n][c][h][w]`.
+    pub x: &'a [f32],
+    /// `[n][outputs]`.
+    pub labels: &'a [f32],
+    pub seed: u64,
+    pub step: u64,
+}
+
+impl<'a> StepInput<'a> {
+    /// The slices of a batch for `network`.
+    ///
+    /// # Panics
+    ///
+    /// Panics if a shape does not fit or an array is not contiguous in standard order.
+    pub(super) fn slices(&self, network: &Network) -> StepSlices<'a> {
+        let (x, n) = (image_slice(network, self.x), self.x.len_of(ndarray::Axis(0)));
+        let labels = self.labels.to_slice().expect("labels must be contiguous");
+        assert_eq!(labels.len(), n * network.output().len(), "labels for a batch of {n} images");
+        StepSlices { x, labels, seed: self.seed, step: self.step }
+    }
+}
+
+/// The images `x`, `(n, c, h, w)`, as a slice.
+///
+/// # Panics
+///
+/// Panics if they are not of the network's input shape, or not contiguous in standard order.
+pub(super) fn image_slice<'a>(network: &Network, x: ArrayView4<'a, f32>) -> &'a [f32] {
+    let n = x.len_of(ndarray::Axis(0));
+    assert_eq!(x.dim(), network.input().batch(n), "images (n, c, h, w) of another shape than the network's input");
+    x.to_slice().expect("images must be contiguous in standard order")
+}

@@ -1,0 +1,120 @@
+//! The wiring of a training run, end to end: which images are validated, which rate belongs to which update, which epoch becomes
+//! the model, when a run stops, and in which unit errors are told.
+//!
+//! The network is linear and the recording short, so that a run takes less than a second and each of these questions has an
+//! answer that can be computed here.
+
+mod common;
+
+use std::path::Path;
+
+use common::command::json;
+use serde_json::Value;
+use steersman::engine::network::Parameters;
+use steersman::model_file::Model;
+use steersman::training::{EpochRecord, read_history};
+
+const LINEAR: &str = "layers=[{kind='scale', factor=0.004, offset=-0.5}, {kind='flatten'}, {kind='dense', units=1}]";
+const BATCH: u64 = 8;
+/// A rate so small that no weight changes: the network stays as it was drawn.
+const AT_REST: &str = "optimizer.learning_rate=1e-30";
+/// A rate that grows in every update. The validation loss falls in the first two epochs and nearly doubles in the third, when
+/// the steps have become too long.
+const RISING: [&str; 2] = ["optimizer.learning_rate=10.0", "schedule.warmup_updates=100000"];
+
+/// A finished run: what it printed, and its epochs.
+fn train(folder: &Path, out: &str, settings: &[&str]) -> (Value, Vec<EpochRecord>) {
+    let recording = Path::new(env!("CARGO_MANIFEST_DIR")).join("data/sample");
+    let batch = format!("batch={BATCH}");
+    let mut args =
+        vec!["train", recording.to_str().unwrap(), "--recipe", "lenet", "--out", out, "--seed", "5", "--json"];
+    for setting in [LINEAR, "preprocessing.resize=[16, 16]", &batch].iter().chain(settings) {
+        args.extend(["--set", setting]);
+    }
+    (json(folder, &args), read_history(&folder.join(out).join("history.csv")).unwrap())
+}
+
+fn weights(folder: &Path, out: &str, file: &str) -> Parameters {
+    Model::load(&folder.join(out).join(file)).unwrap().parameters
+}
+
+#[test]
+fn validation_images_are_not_augmented() {
+    let folder = tempfile::tempdir().unwrap();
+    let (plain, _) = train(folder.path(), "plain", &["epochs=1", AT_REST]);
+    let changes = ["augmentation.saturation=[0.1, 0.5]", "augmentation.contrast=[0.3, 0.6]"];
+    let (augmented, _) = train(folder.path(), "augmented", &["epochs=1", AT_REST, changes[0], changes[1]]);
+    assert_ne!(plain["train_mse"], augmented["train_mse"], "training images are augmented");
+    for figure in ["val_mse", "val_center_mse", "val_mae_deg"] {
+        assert!(plain[figure].is_number());
+        assert_eq!(plain[figure], augmented[figure], "{figure}");
+    }
+}
+
+/// `history.csv` has the rate of the last update of each epoch, which follows upon all updates but itself.
+#[test]
+fn the_schedule_counts_the_updates_that_are_done() {
+    let folder = tempfile::tempdir().unwrap();
+    let decay = "schedule.shape={kind='time_decay', decay_per_update=1.0}";
+    let (result, history) = train(folder.path(), "decay", &["epochs=3", "optimizer.learning_rate=1e-3", decay]);
+    let updates_per_epoch = result["train_images"].as_u64().unwrap().div_ceil(BATCH);
+    assert_eq!(history.len(), 3);
+    for record in history {
+        let earlier = u64::from(record.epoch) * updates_per_epoch - 1;
+        approx::assert_relative_eq!(record.learning_rate, 1e-3 / (1.0 + earlier as f64), max_relative = 1e-12);
+    }
+}
+
+#[test]
+fn the_model_has_the_weights_of_the_best_epoch_and_not_of_the_last() {
+    let folder = tempfile::tempdir().unwrap();
+    let (result, history) = train(folder.path(), "three", &["epochs=3", RISING[0], RISING[1]]);
+    let loss = |epoch: usize| history[epoch - 1].val_mse.unwrap();
+    assert!(loss(2) < 0.8 * loss(1) && loss(3) > 1.2 * loss(2), "the second epoch is the best: {history:?}");
+    assert_eq!((&result["best_epoch"], &result["epochs"]), (&2.into(), &3.into()));
+    assert_eq!(result["val_mse"].as_f64(), history[1].val_mse);
+
+    train(folder.path(), "two", &["epochs=2", RISING[0], RISING[1]]);
+    let best = weights(folder.path(), "three", "model.safetensors");
+    assert!(best == weights(folder.path(), "two", "last.safetensors"), "the weights after two epochs");
+    assert!(best != weights(folder.path(), "three", "last.safetensors"), "training went on in the third");
+}
+
+#[test]
+fn a_run_stops_in_the_first_epoch_that_completes_the_patience() {
+    let folder = tempfile::tempdir().unwrap();
+    for patience in [1, 2] {
+        let stopping = format!("early_stopping={{patience_epochs={patience}, min_delta=0.01}}");
+        let out = format!("patience-{patience}");
+        let (result, history) = train(folder.path(), &out, &["epochs=12", RISING[0], RISING[1], &stopping]);
+        let (mut lowest, mut since, mut expected) = (f64::INFINITY, 0, None);
+        for record in &history {
+            let loss = record.val_mse.unwrap();
+            (lowest, since) = if loss < lowest - 0.01 { (loss, 0) } else { (lowest, since + 1) };
+            if since == patience && expected.is_none() {
+                expected = Some(record.epoch);
+            }
+        }
+        assert_eq!(result["epochs"].as_u64(), expected.map(u64::from), "{history:?}");
+        assert!(history.len() < 12, "it stopped early");
+    }
+}
+
+/// A network of zeros predicts 0, so its error is the label itself: times the full lock it is degrees.
+#[test]
+fn the_mean_absolute_error_is_in_degrees_of_the_front_wheels() {
+    let folder = tempfile::tempdir().unwrap();
+    let zeros = "layers=[{kind='flatten'}, {kind='dense', units=1, init={constant=0.0}}]";
+    for full_lock_deg in [25.0, 40.0] {
+        let (out, setting) = (format!("lock-{full_lock_deg}"), format!("full_lock_deg={full_lock_deg:?}"));
+        let (result, history) = train(folder.path(), &out, &["epochs=1", AT_REST, zeros, &setting]);
+        let mut split = csv::Reader::from_path(folder.path().join(&out).join("split.csv")).unwrap();
+        let rows = split.records().map(|row| row.unwrap()).filter(|row| &row[2] == "validation");
+        let labels: Vec<f64> = rows.map(|row| row[4].parse::<f64>().unwrap().abs()).collect();
+        let expected = full_lock_deg * labels.iter().sum::<f64>() / labels.len() as f64;
+        assert!(expected > 1.0, "labels far enough from 0 to tell units apart");
+        approx::assert_relative_eq!(result["val_mae_deg"].as_f64().unwrap(), expected, max_relative = 1e-5);
+        approx::assert_relative_eq!(history[0].val_mae_deg.unwrap(), expected, max_relative = 1e-5);
+        approx::assert_relative_eq!(result["relative_to_zero"].as_f64().unwrap(), 1.0, max_relative = 1e-5);
+    }
+}
