@@ -273,7 +273,7 @@ fn digest_of<'a>(metadata: &str, tensors: impl Iterator<Item = TensorParts<'a>>)
 /// # Errors
 ///
 /// As [`Model::load`] for a file that is no model.
-pub(crate) fn notice_without_digest(path: &Path) -> Result<Option<String>> {
+pub fn notice_without_digest(path: &Path) -> Result<Option<String>> {
     let bytes = read_file(path)?;
     let (_, header) = SafeTensors::read_metadata(&bytes).map_err(damaged(path))?;
     let metadata = header.metadata().as_ref().and_then(|info| info.get(METADATA_KEY));

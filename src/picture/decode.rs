@@ -32,14 +32,26 @@ const PNG_SIGNATURE: &[u8] = b"\x89PNG\r\n\x1a\n";
 /// # Errors
 /// A short sentence that says what is wrong with the image; the caller knows its place.
 pub fn decode_rgb(bytes: &[u8], image: &mut RgbImage) -> Result<(), String> {
-    decode_rgb_within(bytes, MAX_SIDE, image)
+    decode(bytes, MAX_SIDE, Damage::Tolerated, image)
 }
 
-/// [`decode_rgb`] for images of strangers: what is higher or wider than `max_side` pixels is not decoded.
+/// [`decode_rgb`] for frames that a car is driven by: an image with a side of more than `max_side` pixels is an error, and so is
+/// any damage that the decoder meets in a JPEG, also where it could paint the missing part grey.
 ///
 /// # Errors
 /// As [`decode_rgb`].
 pub fn decode_rgb_within(bytes: &[u8], max_side: usize, image: &mut RgbImage) -> Result<(), String> {
+    decode(bytes, max_side, Damage::Refused, image)
+}
+
+/// What to do with a JPEG whose data are damaged and can be decoded in part.
+#[derive(Clone, Copy, PartialEq)]
+enum Damage {
+    Tolerated,
+    Refused,
+}
+
+fn decode(bytes: &[u8], max_side: usize, damage: Damage, image: &mut RgbImage) -> Result<(), String> {
     if bytes.is_empty() {
         Err("the image is empty".into())
     } else if bytes.starts_with(PNG_SIGNATURE) {
@@ -48,7 +60,7 @@ pub fn decode_rgb_within(bytes: &[u8], max_side: usize, image: &mut RgbImage) ->
         if !ends_complete(bytes) {
             return Err("the JPEG is truncated".into());
         }
-        decode_jpeg(bytes, max_side, image)
+        decode_jpeg(bytes, max_side, damage, image)
     } else {
         Err("neither a JPEG nor a PNG image".into())
     }
@@ -86,9 +98,10 @@ pub fn starts_as_image(head: &[u8]) -> bool {
     head.starts_with(&[0xff, 0xd8]) || head.starts_with(PNG_SIGNATURE)
 }
 
-fn decode_jpeg(bytes: &[u8], max_side: usize, image: &mut RgbImage) -> Result<(), String> {
+fn decode_jpeg(bytes: &[u8], max_side: usize, damage: Damage, image: &mut RgbImage) -> Result<(), String> {
     let options = DecoderOptions::default()
         .jpeg_set_out_colorspace(ColorSpace::RGB)
+        .set_strict_mode(damage == Damage::Refused)
         .set_max_width(max_side)
         .set_max_height(max_side);
     let mut decoder = JpegDecoder::new_with_options(ZCursor::new(bytes), options);
@@ -251,6 +264,15 @@ mod tests {
         }
         assert!(decode_rgb(b"GIF89a and so on", &mut image).is_err());
         assert!(decode_rgb(PNG_SIGNATURE, &mut image).is_err());
+    }
+
+    #[test]
+    fn half_of_a_jpeg_with_an_end_marker_is_no_frame_to_drive_by() {
+        let whole = jpeg(&gradient(160, 120), 160, 120);
+        let half = [&whole[..whole.len() / 2], &[0xff, 0xd9]].concat();
+        let mut image = RgbImage::default();
+        assert!(decode_rgb_within(&whole, 160, &mut image).is_ok());
+        assert!(decode_rgb_within(&half, 160, &mut image).is_err());
     }
 
     #[test]
