@@ -42,6 +42,7 @@
 //! A recording is a folder with a `driving_log.csv`, or a donkeycar tub; `data/sample` is a very short one.
 //!
 //! ```
+//! use steersman::dataset::Description;
 //! use steersman::observer::StopSignal;
 //! use steersman::recipe::Recipe;
 //! use steersman::training::{TrainRequest, TrainingEvent, train};
@@ -54,8 +55,8 @@
 //! // The recipe is the experiment: preprocessing, network, split, optimizer. A path ending in .toml names one of your own.
 //! let recipe = Recipe::find("lenet", &["epochs=2".into(), "batch=16".into()])?;
 //! let recordings = vec!["data/sample".into()];
-//! let (from, algorithm, profile) = (None, None, false);
-//! let request = TrainRequest { recordings, recipe, out, seed: 1, cache_mib: 64, from, algorithm, profile };
+//! let (said, from, algorithm, profile) = (Description::default(), None, None, false);
+//! let request = TrainRequest { recordings, said, recipe, out, seed: 1, cache_mib: 64, from, algorithm, profile };
 //! let stop = StopSignal::default(); // requested from elsewhere, it ends the run after the current batch
 //! let mut observer = |event| {
 //!     match event {

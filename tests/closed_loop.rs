@@ -6,6 +6,7 @@
 use std::path::Path;
 
 use steersman::Error;
+use steersman::dataset::Description;
 use steersman::main_job::experiment::{self, ExperimentEvent, Plan, Subject, write_csv};
 use steersman::main_job::job::{Job, JobEvent, JobNote, JobRequest, Scope};
 use steersman::main_job::training_set::{Take, recordings};
@@ -24,6 +25,7 @@ fn learn(folder: &Path, threads: usize) -> (TrainResult, TrackResult) {
     pool.install(|| {
         let request = TrainRequest {
             recordings: recordings(&folder.join("recordings"), &takes, &mut Unobserved).unwrap().0,
+            said: Description::default(),
             recipe: Recipe::find("lenet", &overrides).unwrap(),
             out: folder.join(format!("run-{threads}")),
             seed: 1,

@@ -8,9 +8,10 @@ use rayon::prelude::*;
 use serde::Serialize;
 use steersman_kernels::Isa;
 
+use super::recording_args::RecordingArgs;
 use super::{load_model, or_dash, pool, print_json};
 use crate::dataset::held_out::trained_on_held_out;
-use crate::dataset::{self, Recording, View};
+use crate::dataset::{Recording, View};
 use crate::error::{Error, Result};
 use crate::metrics::{Metrics, Prediction};
 use crate::pilot::Pilot;
@@ -20,9 +21,11 @@ use crate::pilot::Pilot;
 pub struct EvaluateArgs {
     /// Model file
     model: PathBuf,
-    /// Udacity logs or donkeycar tubs
+    /// Recordings: folders, logs, or .zip and .tar.gz archives of them
     #[arg(required = true, value_name = "RECORDING")]
     recordings: Vec<PathBuf>,
+    #[command(flatten)]
+    reading: RecordingArgs,
     /// Threads; 0 is one for each core
     #[arg(long, default_value_t = 0)]
     threads: usize,
@@ -50,8 +53,8 @@ pub fn run(args: EvaluateArgs) -> Result<()> {
     let pool = pool(args.threads)?;
     let mut predictions = Vec::new();
     let (mut known, mut sessions_before) = (0, 0);
-    for path in &args.recordings {
-        let recording = pool.install(|| dataset::load(path))?;
+    for path in &args.reading.expand(args.recordings)? {
+        let recording = pool.install(|| args.reading.load(path))?;
         for notice in recording.notices_for(&pilot.recipe().preprocessing) {
             eprintln!("{notice}");
         }
@@ -97,8 +100,11 @@ pub fn run(args: EvaluateArgs) -> Result<()> {
 fn predict(pilot: &Pilot, recording: &Recording, sessions_before: usize) -> Vec<Prediction> {
     let session_of = |row: usize| recording.sessions.partition_point(|session| session.end <= row);
     let predict_row = |pilot: &mut Pilot, row: usize| {
-        let path = recording.image_path(row, View::Centre)?;
-        match pilot.steer_file(&path) {
+        let mut bytes = Vec::new();
+        let read = recording.read_picture(row, View::Centre, &mut bytes);
+        let place = || recording.image_path(row, View::Centre).unwrap_or_default();
+        let named = |error: Error| Error::data(place(), error.to_string());
+        match read.and_then(|()| pilot.steer_encoded(&bytes).map_err(named)) {
             Ok(steering) => Some(Prediction {
                 steering,
                 label: recording.rows[row].steering,

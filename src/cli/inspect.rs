@@ -3,23 +3,27 @@
 use std::path::PathBuf;
 
 use clap::Args;
+use serde::Serialize;
 
+use super::recording_args::RecordingArgs;
 use super::share_bar::ShareBar;
 use super::{RecipeArgs, new_folder, pool, print, print_json, refuse_existing, stop_on_ctrl_c};
-use crate::dataset::inspect::inspect;
-use crate::error::Result;
+use crate::dataset::inspect::{Report, inspect};
+use crate::error::{Error, Result};
 use crate::files::atomic_file;
 use crate::report::pages::inspection;
 
 /// Say what is in a recording: rows, sessions, labels, pictures, what cannot be used, and what to do about it
 #[derive(Debug, Args)]
 pub struct InspectArgs {
-    /// Udacity logs (a folder or a CSV file) or donkeycar tubs
+    /// Recordings: folders, logs, or .zip and .tar.gz archives of them
     #[arg(required = true, value_name = "RECORDING")]
     recordings: Vec<PathBuf>,
     /// Write a page with pictures, report.html, into this folder, which must not exist
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
+    #[command(flatten)]
+    reading: RecordingArgs,
     #[command(flatten)]
     recipe: RecipeArgs,
     /// Seed of the split that the page shows
@@ -33,21 +37,46 @@ pub struct InspectArgs {
     json: bool,
 }
 
+/// What `--json` prints for a recording.
+#[derive(Serialize)]
+#[serde(untagged)]
+enum Answer {
+    Report(Box<Report>),
+    Failed { path: String, error: String },
+}
+
 pub fn run(args: InspectArgs) -> Result<()> {
     let recipe = args.recipe.find()?;
     args.out.as_deref().map_or(Ok(()), refuse_existing)?;
     let (pool, stop) = (pool(args.threads)?, stop_on_ctrl_c()?);
-    let mut inspections = Vec::new();
-    for path in &args.recordings {
+    let said = args.reading.said();
+    let (mut inspections, mut reports, mut failed) = (Vec::new(), Vec::new(), Vec::new());
+    for path in &args.reading.expand(args.recordings)? {
         let mut bar = ShareBar::new(format!("looking at {}", path.display()), &stop);
-        let inspection = pool.install(|| inspect(path, &mut bar))?;
+        let inspection = pool.install(|| inspect(path, &said, &mut bar));
         drop(bar);
+        let inspection = match inspection {
+            Ok(inspection) => inspection,
+            Err(Error::Interrupted) => return Err(Error::Interrupted),
+            // The other recordings are looked at all the same.
+            Err(error) => {
+                reports.push(Answer::Failed { path: path.display().to_string(), error: error.to_string() });
+                failed.push(error);
+                continue;
+            }
+        };
         if !args.json {
             print(&format!("{}\n", inspection.report))?;
         }
+        let report = &inspection.report;
+        if report.usable == 0 {
+            failed.push(Error::data(path, format!("none of {} rows can be used", report.rows)));
+        } else if let Some(trouble) = inspection.recording.unit_trouble() {
+            failed.push(Error::data(path, trouble));
+        }
+        reports.push(Answer::Report(Box::new(report.clone())));
         inspections.push(inspection);
     }
-    let reports: Vec<_> = inspections.iter().map(|inspection| inspection.report.clone()).collect();
     if let Some(out) = &args.out {
         let page = inspection::page(inspections, &recipe, args.seed);
         new_folder(out)?;
@@ -55,5 +84,11 @@ pub fn run(args: InspectArgs) -> Result<()> {
         atomic_file::write(&path, page.as_bytes())?;
         eprintln!("wrote {}", path.display());
     }
-    if args.json { print_json(&reports) } else { Ok(()) }
+    if args.json {
+        print_json(&reports)?;
+    }
+    // The last one ends the command, those before it are told.
+    let last = failed.pop();
+    failed.iter().for_each(|error| eprintln!("error: {error}"));
+    last.map_or(Ok(()), Err)
 }

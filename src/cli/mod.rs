@@ -27,6 +27,7 @@ mod inspect;
 mod predict;
 mod progress;
 mod record;
+mod recording_args;
 mod serve;
 mod share_bar;
 mod sim;

@@ -7,6 +7,7 @@ use clap::Args;
 use steersman_kernels::conv::ConvAlgorithm;
 
 use super::progress::{JobDisplay, TrainingDisplay};
+use super::recording_args::RecordingArgs;
 use super::{RecipeArgs, or_dash, pool, print_json, stop_on_ctrl_c};
 use crate::dataset::held_out::{self, trained_on_held_out};
 use crate::error::{Error, Result};
@@ -18,10 +19,12 @@ use crate::training::{self, RunFolder, TrainRequest, TrainResult, TransferReques
 /// Train a network on recordings
 #[derive(Debug, Args)]
 pub struct TrainArgs {
-    /// Udacity logs (a folder or its driving_log.csv) or donkeycar tubs. Without any, the whole job is done: the expert's
+    /// Recordings: folders, logs, or .zip and .tar.gz archives of them. Without any, the whole job is done: the expert's
     /// drives in the simulator are recorded under data/recordings/, trained on, and the model drives
     #[arg(value_name = "RECORDING")]
     recordings: Vec<PathBuf>,
+    #[command(flatten)]
+    reading: RecordingArgs,
     #[command(flatten)]
     recipe: RecipeArgs,
     /// Run folder; a new one under runs/ by default
@@ -48,6 +51,9 @@ pub struct TrainArgs {
     /// Go on with a run that was stopped, as if it had never stopped
     #[arg(long, value_name = "RUN", conflicts_with_all = ["recordings", "recipe", "overrides", "out", "seed", "cache", "algorithm"])]
     resume: Option<PathBuf>,
+    /// With --resume: where the recordings of the run are now, in their order, if they were moved
+    #[arg(long = "recordings", value_name = "RECORDING", requires = "resume", num_args = 1..)]
+    moved: Vec<PathBuf>,
     /// Without a recording: runs of the finished model on each track, of one lap
     #[arg(long, default_value_t = 1, conflicts_with_all = ["recordings", "resume"])]
     runs: usize,
@@ -117,18 +123,21 @@ pub fn run(args: TrainArgs) -> Result<()> {
     let mut display = TrainingDisplay::new();
     let (folder, result) = match args.resume {
         Some(folder) => {
-            let result = pool.install(|| training::resume(&folder, args.profile, &mut display, &stop));
+            let moved = (!args.moved.is_empty()).then_some(&args.moved[..]);
+            let result = pool.install(|| training::resume_with(&folder, moved, args.profile, &mut display, &stop));
             (folder, result)
         }
         None => {
             let recipe = recipe()?;
-            let held_out = held_out::check(&args.recordings, args.force_held_out)?;
+            let recordings = args.reading.expand(args.recordings)?;
+            let held_out = held_out::check(&recordings, args.force_held_out)?;
             if !held_out.is_empty() {
                 eprintln!("note: {}", trained_on_held_out(&held_out));
             }
             let (out, claimed) = out_or_next(args.out, &recipe.name)?;
             let request = TrainRequest {
-                recordings: args.recordings,
+                recordings,
+                said: args.reading.said(),
                 recipe,
                 out: out.clone(),
                 seed: args.seed,
@@ -201,16 +210,34 @@ fn explain_stop<T>(result: Result<T>, folder: Option<&Path>) -> Result<T> {
     result
 }
 
+/// A leak above this, in percent, is worth a word.
+const MUCH_LEAK: f64 = 3.0;
+
+/// A share in percent; one that is not 0 never reads as 0.
+fn percent(value: f64) -> String {
+    if value > 0.0 && value < 0.05 { "<0.1".into() } else { format!("{value:.1}") }
+}
+
 fn print_training(result: &TrainResult) {
+    let twins = result.near_twin_percent.unwrap_or(0.0);
+    let leak = result.leak_percent.max(twins);
     println!(
-        "trained on {} images for {} epochs in {:.1} s ({:.0} images/s); {} validation images, leak {:.1} %",
+        "trained on {} images for {} epochs in {:.1} s ({:.0} images/s); {} validation images, leak {} %",
         result.train_images,
         result.epochs,
         result.seconds,
         result.images_per_second,
         result.val_images,
-        result.leak_percent
+        percent(leak)
     );
+    if leak > MUCH_LEAK {
+        println!(
+            "note: {} % of the validation frames look like a training frame, {} % have one within a second: the validation error \
+             is too good. Leave out recordings that are there twice, or a split that leaks; record more road",
+            percent(twins),
+            percent(result.leak_percent)
+        );
+    }
     println!(
         "epoch {}: validation MSE {}; centre camera {}, MAE {} deg, {} of the error of predicting zero",
         result.best_epoch,

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use serde::Serialize;
 
+use super::recording_args::RecordingArgs;
 use super::share_bar::ShareBar;
 use super::{load_pilot, print_json, stop_on_ctrl_c};
 use crate::error::{Error, Result};
@@ -37,6 +38,8 @@ pub struct VideoArgs {
     /// The run of a drive in which the car was put back where it went astray
     #[arg(long)]
     assisted: bool,
+    #[command(flatten)]
+    reading: RecordingArgs,
     /// Print one JSON object as the last line
     #[arg(long)]
     json: bool,
@@ -71,7 +74,7 @@ pub fn run(args: VideoArgs) -> Result<()> {
         let choice = RunChoice { seed: args.seed, assisted: args.assisted };
         replay::film(&args.source, choice, &args.file, onlooker, args.fps, &mut bar)?
     } else {
-        recording::film(&args.source, &args.file, onlooker, args.fps, &mut bar)?
+        recording::film(&args.reading.load(&args.source)?, &args.file, onlooker, args.fps, &mut bar)?
     };
     drop(bar);
     if args.json {

@@ -10,19 +10,24 @@
 //! clamped. [`leak`] measures what the training side gives away of the validation side, [`inspect`] describes a
 //! recording for people.
 
+mod description;
 mod formats;
 pub mod held_out;
 pub mod inspect;
 mod load;
 mod pictures;
 mod recording;
+mod rows;
 mod samples;
+mod store;
 mod unusable;
 
-pub use formats::udacity_writer;
-pub use load::{ImageCheck, load, load_with};
+pub use description::{Column, ColumnRef, DESCRIPTION_FILE, Description, Labels, Unit, parse_columns};
+pub use formats::{table as table_of_formats, udacity_writer};
+pub use load::{load, load_with, recordings_below};
 pub use pictures::{cache, colour, preprocess, resize};
-pub use recording::{ASSUMED_STEP_MS, Kind, Recording, Row, SESSION_GAP_MS, View};
+pub use recording::{Recording, Row, SESSION_GAP_MS, View};
+pub use rows::ImageCheck;
 pub use samples::{Balance, Flip, Group, Item, SampleSpec, augment, leak, loader, split};
 pub use unusable::{Reason, Tally, Unusable};
 

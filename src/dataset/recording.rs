@@ -1,12 +1,14 @@
 //! What is known of a recording once it is read: rows, sessions, and what had to be left out.
 
+use super::formats::Format;
 use super::pictures::files::{Files, Name};
 use super::pictures::preprocess::Preprocessing;
-use super::unusable::{Reason, Unusable};
-use crate::files::limits::read_up_to;
+use super::store::Store;
+use super::unusable::Unusable;
 use crate::picture::RgbImage;
-use crate::picture::decode::{MAX_FILE_LEN, decode_rgb};
+use crate::picture::decode::decode_rgb;
 use crate::{Error, Result};
+use rayon::prelude::*;
 use serde::Serialize;
 use sha2::{Digest, Sha256};
 use std::ops::Range;
@@ -14,20 +16,8 @@ use std::path::{Path, PathBuf};
 
 /// Two rows further apart than this, in milliseconds, belong to different sessions.
 pub const SESSION_GAP_MS: i64 = 1000;
-/// Time between rows, in milliseconds, where a recording has no plausible time stamps (20 Hz).
-pub const ASSUMED_STEP_MS: i64 = 50;
 /// Largest share of unusable rows that training accepts.
 const MAX_UNUSABLE_SHARE: f64 = 0.2;
-/// Who wrote a recording.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Kind {
-    /// The Udacity simulator: a CSV file and a folder `IMG`.
-    Udacity,
-    /// donkeycar: a tub of format 2, `manifest.json` and catalogs.
-    Tub,
-}
-
 /// Which camera of the car a picture is from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "kebab-case")]
@@ -73,8 +63,6 @@ pub struct Row {
     /// Rows written in another folder or session of the recorder have another number.
     pub(super) source: u16,
     pub(super) images: [Option<Name>; 3],
-    /// What is wrong with the left and the right image.
-    pub(super) side_faults: [Option<Reason>; 2],
 }
 
 /// A recording, ready to be split and loaded. Its files are only ever read.
@@ -82,8 +70,8 @@ pub struct Row {
 pub struct Recording {
     /// The folder or file it was read from.
     pub path: PathBuf,
-    /// Who wrote it.
-    pub kind: Kind,
+    /// How it is written.
+    pub(crate) format: &'static Format,
     /// The usable rows, in the order of the log.
     pub rows: Vec<Row>,
     /// Ranges of `rows` that were driven without a break.
@@ -94,9 +82,14 @@ pub struct Recording {
     pub notices: Vec<String>,
     /// Height and width of the first image, if it was looked at.
     pub image_size: Option<[usize; 2]>,
-    /// Whether `time_ms` comes from the recording; otherwise rows count as 20 Hz.
+    /// Whether `time_ms` comes from the recording or the user; otherwise a rate is assumed.
     pub times_plausible: bool,
+    /// Why the labels cannot be believed: they look like another unit than shares of full lock.
+    pub(super) unit_trouble: Option<String>,
+    /// A hash of each row's centre picture, once [`Recording::hash_pictures`] has read them.
+    pub(super) picture_hashes: Vec<u64>,
     pub(super) files: Files,
+    pub(super) store: Store,
 }
 
 impl Recording {
@@ -116,9 +109,46 @@ impl Recording {
         Some(self.files.path(name))
     }
 
+    /// Reads the file of the picture of `camera` at `row` into `bytes`.
+    ///
+    /// # Errors
+    /// [`Error::Io`] if there is none, or it cannot be read.
+    pub fn read_picture(&self, row: usize, camera: View, bytes: &mut Vec<u8>) -> Result<()> {
+        match self.image_path(row, camera) {
+            Some(path) => self.store.read(&path, bytes).map_err(Error::io(path)),
+            None => Err(Error::io(&self.path)(std::io::ErrorKind::NotFound.into())),
+        }
+    }
+
+    /// Name of the format.
+    pub fn kind(&self) -> &'static str {
+        self.format.id
+    }
+
+    /// Reads the centre picture of every row and keeps a hash of it, so that [`split`](super::split::split) knows copies.
+    pub fn hash_pictures(&mut self) {
+        let hash = |bytes: &mut Vec<u8>, row: usize| match self.read_picture(row, View::Centre, bytes) {
+            Ok(()) => fingerprint(bytes),
+            // Pictures that cannot be read are no copies of each other.
+            Err(_) => self.row_id(row),
+        };
+        self.picture_hashes = (0..self.rows.len()).into_par_iter().map_init(Vec::new, hash).collect();
+    }
+
+    /// The hash of the centre picture of `row`, where it is known.
+    pub fn picture_hash(&self, row: usize) -> Option<u64> {
+        self.picture_hashes.get(row).copied()
+    }
+
+    /// Length of the file of the picture of `camera` at `row`; 0 without one.
+    pub fn picture_len(&self, row: usize, camera: View) -> u64 {
+        self.image_path(row, camera).map_or(0, |path| self.store.len(&path))
+    }
+
     /// The picture of `camera` at `row`, if there is one that can be read and decoded.
     pub fn picture(&self, row: usize, camera: View) -> Option<RgbImage> {
-        let bytes = read_up_to(&self.image_path(row, camera)?, MAX_FILE_LEN, "a picture").ok()?;
+        let mut bytes = Vec::new();
+        self.read_picture(row, camera, &mut bytes).ok()?;
         let mut image = RgbImage::default();
         decode_rgb(&bytes, &mut image).ok()?;
         Some(image)
@@ -180,6 +210,7 @@ impl Recording {
     /// # Errors
     /// [`Error::Data`] if no row or less than 80 % of the rows can be used, with the reasons.
     pub fn require_usable(&self) -> Result<()> {
+        self.require_unit()?;
         let (total, unusable) = (self.total_rows(), self.unusable.rows());
         if total == 0 {
             return Err(Error::data(&self.path, "the recording has no rows"));
@@ -210,38 +241,24 @@ impl Recording {
         all.map(|text| format!("{}: {text}", self.path.display())).collect()
     }
 
-    /// Decides what the whole recording tells: cameras, times, sessions. Called once, when all rows are read;
-    /// `log` names the file in examples.
-    pub(super) fn settle(&mut self, log: &str) {
-        self.settle_side_cameras(log);
-        self.settle_times();
-        self.settle_sessions();
-    }
-
-    /// A side camera without a single good image falls away; otherwise rows whose side image is bad are left out.
-    fn settle_side_cameras(&mut self, log: &str) {
-        let mut fallen = [false; 2];
-        for (side, fallen) in fallen.iter_mut().enumerate() {
-            let named = self.rows.iter().any(|row| row.side_faults[side].is_some());
-            *fallen = named && !self.rows.iter().any(|row| row.images[side + 1].is_some());
-            if *fallen {
-                let camera = View::ALL[side + 1].name();
-                self.notices.push(format!("no image of the {camera} camera can be read; the camera falls away"));
-            }
+    /// Checks that the labels are shares of full lock, or that the user has said what they are.
+    ///
+    /// # Errors
+    /// [`Error::Data`] with the likely unit.
+    pub fn require_unit(&self) -> Result<()> {
+        match &self.unit_trouble {
+            Some(trouble) => Err(Error::data(&self.path, trouble.as_str())),
+            None => Ok(()),
         }
-        let Self { rows, unusable, .. } = self;
-        rows.retain(|row| {
-            let fault = (0..2).filter(|&side| !fallen[side]).find_map(|side| Some((side, row.side_faults[side]?)));
-            if let Some((side, reason)) = fault {
-                let camera = View::ALL[side + 1].name();
-                unusable.add(reason, || format!("{log}:{}: {camera} image", row.line));
-            }
-            fault.is_none()
-        });
     }
 
-    /// Times are believed if nine rows of ten have one and the rate is 1 to 100 Hz.
-    fn settle_times(&mut self) {
+    /// Why the labels of the recording cannot be used as they are, if so.
+    pub fn unit_trouble(&self) -> Option<&str> {
+        self.unit_trouble.as_deref()
+    }
+
+    /// Times are believed if nine rows of ten have one and the rate is 1 to 100 Hz; unless the user says the rate.
+    pub(super) fn settle_times(&mut self, said_hz: Option<f64>, assumed_hz: f64) {
         let timed = self.rows.iter().filter(|row| row.time_ms != i64::MIN).count();
         let mut last = None;
         let mut steps = Vec::new();
@@ -250,19 +267,26 @@ impl Recording {
             last = Some(row.time_ms);
         }
         let step_ms = median(steps);
-        self.times_plausible = self.rows.len() < 2
+        let plausible = self.rows.len() < 2
             || (timed * 10 >= self.rows.len() * 9 && step_ms.is_some_and(|ms| (10..=1000).contains(&ms)));
-        if !self.times_plausible {
+        self.times_plausible = plausible || said_hz.is_some();
+        if let Some(hz) = said_hz {
+            self.notices.push(format!("the rows count as {hz} Hz, as was said"));
+        } else if !plausible {
             let found = match step_ms {
                 Some(ms) if timed > 1 => format!("{ms} ms between rows"),
                 _ => "none".to_string(),
             };
-            self.notices.push(format!("time stamps are implausible ({found}); the rows count as 20 Hz"));
+            self.notices.push(format!(
+                "time stamps are implausible ({found}); the rows are assumed to count as {assumed_hz} Hz: say --hz, or hz = … in \
+                 steersman.toml, if it was another rate"
+            ));
         }
+        let hz = said_hz.or((!plausible).then_some(assumed_hz));
         let mut time_ms = 0;
         for (i, row) in self.rows.iter_mut().enumerate() {
-            if !self.times_plausible {
-                row.time_ms = i as i64 * ASSUMED_STEP_MS;
+            if let Some(hz) = hz {
+                row.time_ms = (i as f64 * 1000.0 / hz).round() as i64;
             } else if row.time_ms == i64::MIN {
                 row.time_ms = time_ms;
             }
@@ -270,7 +294,7 @@ impl Recording {
         }
     }
 
-    fn settle_sessions(&mut self) {
+    pub(super) fn settle_sessions(&mut self) {
         let mut start = 0;
         for end in 1..=self.rows.len() {
             let breaks = self.rows.get(end).is_none_or(|next| {
@@ -284,6 +308,19 @@ impl Recording {
             }
         }
     }
+}
+
+/// A hash of `bytes` that is the same in every version of this program.
+fn fingerprint(bytes: &[u8]) -> u64 {
+    let mut hash = bytes.len() as u64;
+    let mut mix = |word: u64| {
+        hash = (hash ^ word).wrapping_mul(0x9e37_79b9_7f4a_7c15);
+        hash ^= hash >> 32;
+    };
+    let (words, rest) = bytes.as_chunks::<8>();
+    words.iter().for_each(|word| mix(u64::from_le_bytes(*word)));
+    rest.iter().for_each(|&byte| mix(u64::from(byte)));
+    hash
 }
 
 /// Last part of a path, for messages.

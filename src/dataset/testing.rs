@@ -1,8 +1,8 @@
 //! What the tests of this module share.
 
 use super::pictures::files::Files;
-use super::recording::{Kind, Recording, Row, View};
-use crate::dataset::unusable::Unusable;
+use super::recording::{Recording, Row, View};
+use super::unusable::Unusable;
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -48,17 +48,19 @@ pub(crate) fn recording_of(steering: &[f32], step_ms: i64) -> Recording {
         line: i as u32 + 1,
         source: 0,
         images,
-        side_faults: [None; 2],
     });
     Recording {
         path: "memory".into(),
-        kind: Kind::Udacity,
+        format: super::formats::FORMATS[3],
         rows: rows.collect(),
         sessions: std::iter::once(0..steering.len()).filter(|session| !session.is_empty()).collect(),
         unusable: Unusable::default(),
         notices: Vec::new(),
         image_size: None,
         times_plausible: true,
+        unit_trouble: None,
+        picture_hashes: Vec::new(),
         files,
+        store: super::store::Store::Disk,
     }
 }

@@ -22,10 +22,12 @@ pub enum Reason {
     LabelOutOfRange,
     /// An image file is not there.
     ImageMissing,
-    /// An image file is empty or ends too early.
+    /// An image file is empty, ends too early or cannot be decoded.
     ImageTruncated,
     /// An image file is neither JPEG nor PNG, or cannot be read.
     NotAnImage,
+    /// The path of an image is that of a FIFO, a device or a socket.
+    NotAFile,
 }
 
 impl Reason {
@@ -38,8 +40,9 @@ impl Reason {
             Reason::NotANumber => "not a number",
             Reason::LabelOutOfRange => "label out of range or not finite",
             Reason::ImageMissing => "image missing",
-            Reason::ImageTruncated => "image truncated",
+            Reason::ImageTruncated => "image damaged or truncated",
             Reason::NotAnImage => "not a readable image",
+            Reason::NotAFile => "no regular file",
         }
     }
 }

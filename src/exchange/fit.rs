@@ -19,7 +19,7 @@ use crate::engine::network::{InferencePlan, Network, Parameters};
 use crate::engine::tensor::Shape;
 use crate::error::{Error, Result};
 use crate::metrics::correlation;
-use crate::picture::{RgbImage, decode::decode_rgb};
+use crate::picture::RgbImage;
 
 /// Kept rows of Udacity's picture, in projects of the field.
 const CROPS: [[usize; 2]; 12] = [
@@ -85,9 +85,7 @@ impl Frames {
         let mut chosen = [turned, straight].concat();
         chosen.sort_unstable();
         let read = |row: usize| -> Option<(RgbImage, f32)> {
-            let bytes = std::fs::read(recording.image_path(row, View::Centre)?).ok()?;
-            let mut image = RgbImage::default();
-            decode_rgb(&bytes, &mut image).ok()?;
+            let mut image = recording.picture(row, View::Centre)?;
             // All combinations begin by scaling the image to this size; so much of it is kept in memory.
             let whole = Preprocessing::default();
             if [image.height, image.width] != whole.source {

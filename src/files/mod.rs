@@ -5,5 +5,6 @@ pub(crate) mod checksums;
 pub(crate) mod limits;
 pub(crate) mod lock;
 pub mod new_folder;
+pub mod tar_archive;
 pub(crate) mod unfinished;
 pub mod zip_archive;

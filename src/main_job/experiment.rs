@@ -8,6 +8,7 @@ use serde_json::Value;
 
 use super::job::{JobEvent, test_on_tracks};
 use super::{TrackResult, training_set};
+use crate::dataset::Description;
 use crate::dataset::colour::Colour;
 use crate::dataset::split::SplitMode;
 use crate::error::{Error, Result};
@@ -141,6 +142,7 @@ pub fn run(
             observer.observe(ExperimentEvent::Job(JobEvent::Notice(format!("{variant}, seed {seed}"))))?;
             let request = TrainRequest {
                 recordings: plan.recordings.clone(),
+                said: Description::default(),
                 recipe: recipe.clone(),
                 out: folder.path().join(format!("{variant}-{seed}")),
                 seed,

@@ -9,6 +9,7 @@ use steersman_kernels::conv::ConvAlgorithm;
 use super::training_set::{self, Take};
 use super::{MainJobResult, TRACKS, TrackResult, dagger, test_on_track};
 
+use crate::dataset::Description;
 use crate::error::{Error, Result};
 use crate::files::checksums;
 use crate::observer::{Observer, Parts, Progress, StopSignal};
@@ -171,8 +172,17 @@ impl<'a> Job<'a> {
         }
         let recordings = training_set(&self.scope.recordings, &self.scope.takes, self.observer, self.stop)?;
         let profile = self.profile;
-        let training =
-            self.train(TrainRequest { recordings, recipe, out, seed, cache_mib, from, profile, algorithm })?;
+        let training = self.train(TrainRequest {
+            recordings,
+            said: Description::default(),
+            recipe,
+            out,
+            seed,
+            cache_mib,
+            from,
+            profile,
+            algorithm,
+        })?;
         self.rest(training)
     }
 
@@ -238,7 +248,17 @@ impl<'a> Job<'a> {
             return self.resume(&out);
         }
         let (seed, cache_mib, profile) = (info.seed, info.cache_mib, self.profile);
-        self.train(TrainRequest { recordings, recipe, out, seed, cache_mib, from: None, profile, algorithm })
+        self.train(TrainRequest {
+            recordings,
+            said: Description::default(),
+            recipe,
+            out,
+            seed,
+            cache_mib,
+            from: None,
+            profile,
+            algorithm,
+        })
     }
 
     /// Whether `out` holds the run of this job's round on `recordings` already, begun before a stop.

@@ -1,8 +1,9 @@
 //! Decoding of JPEG and PNG images to 8-bit RGB.
 
+use image::ImageDecoder as _;
+use image::metadata::Orientation;
 use std::borrow::Cow;
 use std::io::Cursor;
-
 use zune_jpeg::JpegDecoder;
 use zune_jpeg::zune_core::bytestream::ZCursor;
 use zune_jpeg::zune_core::colorspace::ColorSpace;
@@ -25,48 +26,34 @@ const MAX_DECODED_LEN: u64 = 64 << 20;
 /// First bytes of every PNG file.
 const PNG_SIGNATURE: &[u8] = b"\x89PNG\r\n\x1a\n";
 
-/// Decodes a JPEG or PNG file held in `bytes` into `image`.
+/// Decodes a JPEG or PNG file held in `bytes` into `image`, upright if its EXIF data say how it was held.
 ///
-/// A JPEG that ends before its end marker is an error, not a picture with a grey bottom.
+/// A JPEG whose picture data end early is an error, not a picture with a grey bottom, whether it has an end marker or not.
+/// What stands behind the end marker is ignored: some cameras pad their files.
 ///
 /// # Errors
 /// A short sentence that says what is wrong with the image; the caller knows its place.
 pub fn decode_rgb(bytes: &[u8], image: &mut RgbImage) -> Result<(), String> {
-    decode(bytes, MAX_SIDE, Damage::Tolerated, image)
+    decode_rgb_within(bytes, MAX_SIDE, image)
 }
 
-/// [`decode_rgb`] for frames that a car is driven by: an image with a side of more than `max_side` pixels is an error, and so is
-/// any damage that the decoder meets in a JPEG, also where it could paint the missing part grey.
+/// [`decode_rgb`] for images of strangers: what is higher or wider than `max_side` pixels is not decoded.
 ///
 /// # Errors
 /// As [`decode_rgb`].
 pub fn decode_rgb_within(bytes: &[u8], max_side: usize, image: &mut RgbImage) -> Result<(), String> {
-    decode(bytes, max_side, Damage::Refused, image)
-}
-
-/// What to do with a JPEG whose data are damaged and can be decoded in part.
-#[derive(Clone, Copy, PartialEq)]
-enum Damage {
-    Tolerated,
-    Refused,
-}
-
-fn decode(bytes: &[u8], max_side: usize, damage: Damage, image: &mut RgbImage) -> Result<(), String> {
     if bytes.is_empty() {
         Err("the image is empty".into())
     } else if bytes.starts_with(PNG_SIGNATURE) {
         decode_png(bytes, max_side, image)
     } else if bytes.starts_with(&[0xff, 0xd8]) {
-        if !ends_complete(bytes) {
-            return Err("the JPEG is truncated".into());
-        }
-        decode_jpeg(bytes, max_side, damage, image)
+        decode_jpeg(bytes, max_side, image)
     } else {
         Err("neither a JPEG nor a PNG image".into())
     }
 }
 
-/// Height and width of a JPEG or PNG image, from its header alone.
+/// Height and width of a JPEG or PNG image as it is decoded, from its header alone.
 ///
 /// # Errors
 /// As [`decode_rgb`].
@@ -80,8 +67,12 @@ pub fn image_size(bytes: &[u8]) -> Result<[usize; 2], String> {
         };
     }
     let reader = image::ImageReader::new(Cursor::new(bytes)).with_guessed_format().map_err(|e| e.to_string())?;
-    let (width, height) = reader.into_dimensions().map_err(|e| e.to_string())?;
-    Ok([height as usize, width as usize])
+    let mut decoder = reader.into_decoder().map_err(|e| e.to_string())?;
+    let (width, height) = decoder.dimensions();
+    let [height, width] = [height as usize, width as usize];
+    let is_jpeg = bytes.starts_with(&[0xff, 0xd8]);
+    let turned = is_jpeg && decoder.orientation().is_ok_and(|orientation| orientation.to_exif() > 4);
+    Ok(if turned { [width, height] } else { [height, width] })
 }
 
 /// Whether the last bytes of an image file hold the end marker of a JPEG or the last chunk of a PNG.
@@ -98,14 +89,27 @@ pub fn starts_as_image(head: &[u8]) -> bool {
     head.starts_with(&[0xff, 0xd8]) || head.starts_with(PNG_SIGNATURE)
 }
 
-fn decode_jpeg(bytes: &[u8], max_side: usize, damage: Damage, image: &mut RgbImage) -> Result<(), String> {
-    let options = DecoderOptions::default()
+fn decode_jpeg(bytes: &[u8], max_side: usize, image: &mut RgbImage) -> Result<(), String> {
+    let lenient = DecoderOptions::default()
         .jpeg_set_out_colorspace(ColorSpace::RGB)
-        .set_strict_mode(damage == Damage::Refused)
         .set_max_width(max_side)
-        .set_max_height(max_side);
-    let mut decoder = JpegDecoder::new_with_options(ZCursor::new(bytes), options);
+        .set_max_height(max_side)
+        .set_strict_mode(false);
     let failed = |error: zune_jpeg::errors::DecodeErrors| format!("the JPEG cannot be decoded: {error:?}");
+    // The decoder goes on with grey where an end marker comes too early. Zeros in its place show how far the data reach: those
+    // of a whole picture end before the decoder, which reads 8 bytes ahead, has used them up.
+    let scan = Scan::of(bytes)?;
+    let padded: Vec<u8>;
+    let data = if scan.progressive {
+        if !scan.ended {
+            return Err("the JPEG is truncated".into());
+        }
+        bytes
+    } else {
+        padded = [&bytes[..scan.end], &[0; AHEAD]].concat();
+        &padded
+    };
+    let mut decoder = JpegDecoder::new_with_options(ZCursor::new(data), lenient);
     decoder.decode_headers().map_err(failed)?;
     let (width, height) = decoder.dimensions().ok_or("the JPEG has no size")?;
     check_pixels(height, width)?;
@@ -113,9 +117,85 @@ fn decode_jpeg(bytes: &[u8], max_side: usize, damage: Damage, image: &mut RgbIma
     if decoder.output_buffer_size() != Some(image.pixels.len()) {
         return Err("the JPEG has colours that cannot be turned into RGB".into());
     }
-    decoder.decode_into(&mut image.pixels).map_err(failed)?;
+    decoder.set_options(lenient.set_strict_mode(true));
+    decoder.decode_into(&mut image.pixels).map_err(|error| match error {
+        zune_jpeg::errors::DecodeErrors::ExhaustedData
+        | zune_jpeg::errors::DecodeErrors::FormatStatic("Premature end of buffer") => "the JPEG is truncated".into(),
+        other => failed(other),
+    })?;
     (image.height, image.width) = (height, width);
+    let orientation = decoder.exif().and_then(|exif| Orientation::from_exif_chunk(exif));
+    if let Some(orientation) = orientation.filter(|orientation| *orientation != Orientation::NoTransforms) {
+        turn(image, orientation);
+    }
     Ok(())
+}
+
+/// Bytes behind the picture data that the decoder may read ahead, and some more.
+const AHEAD: usize = 16;
+
+/// Where the picture data of a JPEG end.
+#[derive(Debug, PartialEq, Eq)]
+struct Scan {
+    /// First byte behind the data: the end marker, or the end of the file.
+    end: usize,
+    /// Whether an end marker stands there.
+    ended: bool,
+    /// Whether the data come in several passes over the picture.
+    progressive: bool,
+}
+
+impl Scan {
+    fn of(bytes: &[u8]) -> Result<Scan, String> {
+        let truncated = || "the JPEG is truncated".to_string();
+        let (mut at, mut progressive) = (2, false);
+        loop {
+            // Segments, each with its length, up to the picture data.
+            let marker = loop {
+                let pair = bytes.get(at..at + 2).ok_or_else(truncated)?;
+                match pair {
+                    [0xff, 0xff] => at += 1,
+                    [0xff, marker] if *marker != 0 => break *marker,
+                    // Some cameras leave bytes between segments.
+                    _ => at += 1,
+                }
+            };
+            at += 2;
+            match marker {
+                0xd9 => return Ok(Scan { end: at - 2, ended: true, progressive }),
+                0x01 | 0xd0..=0xd8 => continue,
+                _ => {}
+            }
+            progressive |= matches!(marker, 0xc2 | 0xc6 | 0xca | 0xce);
+            let length = bytes.get(at..at + 2).ok_or_else(truncated)?;
+            at += usize::from(u16::from_be_bytes([length[0], length[1]])).max(2);
+            if marker != 0xda {
+                continue;
+            }
+            // Picture data: 0xff is followed by 0 or a restart marker, up to the next segment.
+            loop {
+                let found = bytes.get(at..).and_then(|rest| rest.iter().position(|&byte| byte == 0xff));
+                let Some(found) = found else { return Ok(Scan { end: bytes.len(), ended: false, progressive }) };
+                at += found;
+                match bytes.get(at + 1) {
+                    None => return Ok(Scan { end: at, ended: false, progressive }),
+                    Some(0 | 0xd0..=0xd7) => at += 2,
+                    Some(0xff) => at += 1,
+                    Some(_) => break,
+                }
+            }
+        }
+    }
+}
+
+/// Turns and mirrors a picture that was taken with the camera in another position.
+fn turn(image: &mut RgbImage, orientation: Orientation) {
+    let (width, height) = (image.width as u32, image.height as u32);
+    let Some(pixels) = image::RgbImage::from_raw(width, height, std::mem::take(&mut image.pixels)) else { return };
+    let mut picture = image::DynamicImage::ImageRgb8(pixels);
+    picture.apply_orientation(orientation);
+    (image.height, image.width) = (picture.height() as usize, picture.width() as usize);
+    image.pixels = picture.into_rgb8().into_raw();
 }
 
 fn decode_png(bytes: &[u8], max_side: usize, image: &mut RgbImage) -> Result<(), String> {
@@ -153,7 +233,7 @@ fn without_metadata(bytes: &[u8]) -> Cow<'_, [u8]> {
         let len = u32::from_be_bytes([*a, *b, *c, *d]) as usize;
         // Length, kind and checksum stand around the content.
         let (chunk, after) = rest.split_at(len.saturating_add(12).min(rest.len()));
-        if !matches!(kind, b"iCCP" | b"tEXt" | b"zTXt" | b"iTXt" | b"eXIf") {
+        if !matches!(kind, b"iCCP" | b"tEXt" | b"zTXt" | b"iTXt") {
             kept.extend_from_slice(chunk);
         }
         rest = after;
@@ -259,7 +339,7 @@ mod tests {
     fn broken_images_are_errors() {
         let whole = jpeg(&gradient(40, 24), 40, 24);
         let mut image = RgbImage::default();
-        for length in [0, 1, 2, 20, whole.len() / 2, whole.len() - 2] {
+        for length in [0, 1, 2, 20, whole.len() / 2] {
             assert!(decode_rgb(&whole[..length], &mut image).is_err(), "{length} bytes of {}", whole.len());
         }
         assert!(decode_rgb(b"GIF89a and so on", &mut image).is_err());
@@ -267,18 +347,59 @@ mod tests {
     }
 
     #[test]
-    fn half_of_a_jpeg_with_an_end_marker_is_no_frame_to_drive_by() {
-        let whole = jpeg(&gradient(160, 120), 160, 120);
-        let half = [&whole[..whole.len() / 2], &[0xff, 0xd9]].concat();
-        let mut image = RgbImage::default();
-        assert!(decode_rgb_within(&whole, 160, &mut image).is_ok());
-        assert!(decode_rgb_within(&half, 160, &mut image).is_err());
+    fn whether_a_picture_is_damaged_is_decided_by_its_data() {
+        let (width, height) = (320, 160);
+        let noisy: Vec<u8> = (0..width * height * 3).map(|i| (i * 2_654_435_761_usize >> 7) as u8 / 2).collect();
+        for pixels in [noisy, gradient(width, height), vec![90; width * height * 3]] {
+            for factor in [jpeg_encoder::SamplingFactor::F_1_1, jpeg_encoder::SamplingFactor::F_2_2] {
+                for restart in [0, 7] {
+                    let mut whole = Vec::new();
+                    let mut encoder = jpeg_encoder::Encoder::new(&mut whole, 90);
+                    encoder.set_sampling_factor(factor);
+                    if restart > 0 {
+                        encoder.set_restart_interval(restart);
+                    }
+                    encoder.encode(&pixels, width as u16, height as u16, jpeg_encoder::ColorType::Rgb).unwrap();
+                    let mut expected = RgbImage::default();
+                    decode_rgb(&whole, &mut expected).unwrap();
+                    let mut image = RgbImage::default();
+                    for padding in [vec![0; 10], vec![0xff; 3], vec![0x55; 1000], b"\xff\xd8 a preview".to_vec()] {
+                        let padded = [&whole[..], &padding].concat();
+                        assert_eq!(decode_rgb(&padded, &mut image), Ok(()));
+                        assert!(image == expected);
+                    }
+                    // Without the marker all of the data are there.
+                    assert_eq!(decode_rgb(&whole[..whole.len() - 2], &mut image), Ok(()));
+                    assert!(image == expected);
+                    let scan = Scan::of(&whole).unwrap();
+                    let begin = (2..whole.len()).find(|&i| whole[i..].starts_with(&[0xff, 0xda])).unwrap() + 20;
+                    for part in [0, 2, 5, 8] {
+                        let cut = &whole[..begin + (scan.end - begin) * part / 10];
+                        for marker in [&b""[..], b"\xff\xd9"] {
+                            let cut = [cut, marker].concat();
+                            assert!(
+                                decode_rgb(&cut, &mut image).is_err(),
+                                "{part} of 10, {marker:?}, restart {restart}"
+                            );
+                        }
+                    }
+                }
+            }
+        }
     }
 
     #[test]
-    fn padding_after_the_end_marker_is_no_truncation() {
-        let mut bytes = jpeg(&gradient(16, 16), 16, 16);
-        bytes.extend([0; 10]);
-        assert!(decode_rgb(&bytes, &mut RgbImage::default()).is_ok());
+    fn pictures_are_turned_as_they_were_taken() {
+        let pixels: Vec<u8> = (0..16 * 32).flat_map(|i| if i % 32 < 16 { [250, 0, 0] } else { [0, 0, 250] }).collect();
+        let whole = jpeg(&pixels, 32, 16);
+        // Orientation 6: the top of the scene is at the right of the sensor.
+        let exif = b"Exif\0\0II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0";
+        let length = (exif.len() as u16 + 2).to_be_bytes();
+        let turned = [&whole[..2], &[0xff, 0xe1], &length, exif, &whole[2..]].concat();
+        let mut image = RgbImage::default();
+        decode_rgb(&turned, &mut image).unwrap();
+        assert_eq!((image.height, image.width), (32, 16));
+        assert_eq!(image_size(&turned), Ok([32, 16]));
+        assert!(image.pixel(3, 8)[0] > 200 && image.pixel(28, 8)[2] > 200);
     }
 }

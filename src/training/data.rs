@@ -10,7 +10,7 @@ use crate::dataset::cache::{CacheSpec, Overflow};
 use crate::dataset::leak::LeakAudit;
 use crate::dataset::loader::{Batch, Loader, LoaderSpec};
 use crate::dataset::split::{Split, split};
-use crate::dataset::{self, Item, Recording};
+use crate::dataset::{self, Description, ImageCheck, Item, Recording, View};
 use crate::engine::tensor::Shape;
 use crate::error::{Error, Result};
 use crate::files::atomic_file;
@@ -32,17 +32,24 @@ pub(crate) struct Data {
 }
 
 impl Data {
-    /// Reads the recordings and splits them as `recipe` says.
+    /// Reads the recordings, of which the user says `said`, and splits them as `recipe` says.
     ///
     /// # Errors
     ///
     /// [`Error::Io`] and [`Error::Data`] for recordings that cannot be used, or if a side would be empty.
-    pub fn prepare(paths: &[PathBuf], recipe: &Recipe, seed: u64, cache_mib: usize) -> Result<Data> {
+    pub fn prepare(
+        paths: &[PathBuf],
+        said: &Description,
+        recipe: &Recipe,
+        seed: u64,
+        cache_mib: usize,
+    ) -> Result<Data> {
         let mut recordings = Vec::new();
         let mut notices = Vec::new();
         for path in paths {
-            let recording = dataset::load(path)?;
+            let mut recording = dataset::load_with(path, said, ImageCheck::Verify)?;
             recording.require_usable()?;
+            recording.hash_pictures();
             notices.extend(recording.notices_for(&recipe.preprocessing));
             recordings.push(recording);
         }
@@ -109,6 +116,20 @@ impl Data {
             for item in side {
                 hash.update(self.row_id(item).to_le_bytes());
                 item.cameras().for_each(|camera| hash.update([camera as u8]));
+            }
+        }
+        hash.finalize().iter().take(16).map(|byte| format!("{byte:02x}")).collect()
+    }
+
+    /// A hash over the pictures of both sides, in hexadecimal digits: the bytes of those of the centre camera, the lengths of
+    /// the files of the others.
+    pub fn pictures_hash(&self) -> String {
+        let mut hash = Sha256::new();
+        for item in self.split.training.iter().chain(&self.split.validation) {
+            let recording = &self.recordings[usize::from(item.recording)];
+            hash.update(recording.picture_hash(item.row as usize).unwrap_or_default().to_le_bytes());
+            for camera in item.cameras().filter(|camera| *camera != View::Centre) {
+                hash.update(recording.picture_len(item.row as usize, camera).to_le_bytes());
             }
         }
         hash.finalize().iter().take(16).map(|byte| format!("{byte:02x}")).collect()

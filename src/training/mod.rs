@@ -28,6 +28,6 @@ pub use crate::engine::loss::Loss;
 pub(crate) use data::Data;
 pub use history::{EpochRecord, read_history};
 pub use profile::ProfileReport;
-pub use run::{TrainRequest, TrainResult, TrainingEvent, resume, train};
+pub use run::{TrainRequest, TrainResult, TrainingEvent, resume, resume_with, train};
 pub(crate) use run_folder::{RunFolder, RunInfo};
 pub use transfer::TransferRequest;

@@ -15,6 +15,7 @@ use super::profile::{Profile, ProfileReport};
 use super::run_folder::{RunFolder, RunInfo, RunLock};
 use super::transfer::{Start, TransferRequest};
 use super::validation::{Validation, ValidationResult};
+use crate::dataset::Description;
 use crate::dataset::held_out::held_out_tracks;
 use crate::dataset::loader::{Batch, Loader};
 use crate::engine::network::{Network, Parameters, StepInput, TrainingPlan};
@@ -35,6 +36,8 @@ const MAX_ROW_IMAGES: usize = 6;
 pub struct TrainRequest {
     /// Udacity logs or donkeycar tubs.
     pub recordings: Vec<PathBuf>,
+    /// What the user says about the recordings.
+    pub said: Description,
     /// The experiment.
     pub recipe: Recipe,
     /// Run folder; must not exist or be empty.
@@ -111,6 +114,9 @@ pub struct TrainResult {
     pub weights_hash: String,
     /// Share of validation frames with a training frame of the same session within a second, in percent.
     pub leak_percent: f64,
+    /// Share of validation frames of the centre camera that look the same as a training frame, in percent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub near_twin_percent: Option<f64>,
     /// Held-out tracks that were trained on all the same, here or by the model that training began from.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub trained_on_held_out: Vec<String>,
@@ -131,11 +137,11 @@ pub fn train(
     stop: &StopSignal,
 ) -> Result<TrainResult> {
     let started = Instant::now();
-    let TrainRequest { recordings, recipe, out, seed, cache_mib, from, algorithm, profile } = request;
+    let TrainRequest { recordings, said, recipe, out, seed, cache_mib, from, algorithm, profile } = request;
     let profile = profile.then(Profile::start);
     let algorithm = algorithm.unwrap_or_else(ConvAlgorithm::of_environment);
     let start = from.as_ref().map(|from| Start::load(&from.model, from, &recipe, seed)).transpose()?;
-    let data = Data::prepare(&recordings, &recipe, seed, cache_mib)?;
+    let data = Data::prepare(&recordings, &said, &recipe, seed, cache_mib)?;
     let mut trained_on_held_out = held_out_tracks(&recordings)?;
     for track in start.iter().flat_map(|start| &start.trained_on_held_out) {
         if !trained_on_held_out.contains(track) {
@@ -152,7 +158,9 @@ pub fn train(
         seed,
         recordings: recordings.iter().map(absolute).collect::<Result<_>>()?,
         cache_mib,
+        said,
         rows_hash: data.rows_hash(),
+        pictures_hash: data.pictures_hash(),
         transfer: start.as_ref().map(|start| start.transfer.clone()),
         trained_on_held_out,
     };
@@ -178,6 +186,21 @@ pub fn resume(
     observer: &mut dyn Observer<TrainingEvent>,
     stop: &StopSignal,
 ) -> Result<TrainResult> {
+    resume_with(path, None, profile, observer, stop)
+}
+
+/// As [`resume`], with the recordings of the run, in their order, where they are now: `moved`.
+///
+/// # Errors
+///
+/// As [`resume`]; [`Error::Usage`] if their number is another.
+pub fn resume_with(
+    path: &Path,
+    moved: Option<&[PathBuf]>,
+    profile: bool,
+    observer: &mut dyn Observer<TrainingEvent>,
+    stop: &StopSignal,
+) -> Result<TrainResult> {
     let started = Instant::now();
     let profile = profile.then(Profile::start);
     let folder = RunFolder::open(path)?;
@@ -191,7 +214,17 @@ pub fn resume(
         observer.observe(TrainingEvent::Notice("this run is finished; here is its result again".into()))?;
         return Ok(TrainResult { model: folder.model(), ..result });
     }
-    let info = folder.info()?;
+    let mut info = folder.info()?;
+    if let Some(moved) = moved {
+        if moved.len() != info.recordings.len() {
+            let (found, needed) = (moved.len(), info.recordings.len());
+            return Err(Error::Usage(format!(
+                "the run has {needed} recordings, --recordings names {found}: name all, in their order"
+            )));
+        }
+        let absolute = |path: &PathBuf| std::path::absolute(path).map_err(Error::io(path));
+        info.recordings = moved.iter().map(absolute).collect::<Result<_>>()?;
+    }
     let recipe = folder.recipe()?;
     let isa = Isa::best().name();
     if info.isa != isa {
@@ -201,10 +234,23 @@ pub fn resume(
             info.isa, info.isa
         )))?;
     }
-    let data = Data::prepare(&info.recordings, &recipe, info.seed, info.cache_mib)?;
+    if let Some(gone) = info.recordings.iter().find(|path| moved.is_none() && !path.exists()) {
+        let message = "the recording is not there any more; if it was moved, say where it is with --recordings";
+        return Err(Error::data(gone, message));
+    }
+    let data = Data::prepare(&info.recordings, &info.said, &recipe, info.seed, info.cache_mib)?;
     if data.rows_hash() != info.rows_hash {
         let message = "the recordings have changed since the run began; it can only go on with the same rows";
         return Err(Error::data(folder.file("run.json"), message));
+    }
+    // Runs of older versions have no such hash.
+    if !info.pictures_hash.is_empty() && data.pictures_hash() != info.pictures_hash {
+        let message =
+            "pictures of the recordings have changed since the run began; it can only go on with the same pictures";
+        return Err(Error::data(folder.file("run.json"), message));
+    }
+    if moved.is_some() {
+        folder.write_json("run.json", &info)?;
     }
     let from = info.transfer.as_ref().map(TransferRequest::of);
     let start = from.map(|from| Start::load(&folder.from(), &from, &recipe, info.seed)).transpose()?;
@@ -398,13 +444,29 @@ impl TrainingRun {
                 loss: mean_loss,
             });
             std::mem::swap(current, next);
-            if let Err(error) = observed.and_then(|()| stop.check()) {
+            let ended = observed.and_then(|()| stop.check()).and_then(|()| self.require_pictures());
+            if let Err(error) = ended {
                 self.state.progress.seconds = seconds_before + self.started.elapsed().as_secs_f64();
                 self.save_checkpoint()?;
                 return Err(error);
             }
         }
         Ok(())
+    }
+
+    /// Fails if more than a fifth of the training pictures could not be read: they vanished while the run went on.
+    fn require_pictures(&self) -> Result<()> {
+        if !self.training.has_decayed() {
+            return Ok(());
+        }
+        let (count, examples) = self.training.undecodable();
+        let message = format!(
+            "{count} of {} pictures cannot be read, more than a fifth is too much: {}. The run is saved; go on with --resume once \
+             they are back",
+            self.training.images(),
+            examples.join("; ")
+        );
+        Err(Error::Data { place: "the recordings".into(), message })
     }
 
     fn diverged(&self, what: &str) -> Error {
@@ -569,13 +631,14 @@ impl TrainingRun {
             val_center_mse: best.val_center_mse,
             val_mae_deg: best.val_mae_deg,
             relative_to_zero: best.relative_to_zero,
-            train_images: self.training.samples(),
+            train_images: self.training.samples_used(),
             val_images: self.validation.as_ref().map_or(0, Validation::images),
             seconds: progress.seconds,
             images_per_second: images as f64 / seconds,
             algorithm: self.info.algorithm.clone(),
             weights_hash: weights_hash(&self.network, &self.state.parameters),
             leak_percent: self.leak_percent,
+            near_twin_percent: self.validation.as_ref().map(|v| 100.0 * v.near_twins(&self.training).share()),
             trained_on_held_out: self.info.trained_on_held_out.clone(),
             profile: None,
         };

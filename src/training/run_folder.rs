@@ -8,6 +8,7 @@ use steersman_kernels::conv::ConvAlgorithm;
 
 use super::history::{EpochRecord, history_csv, read_history};
 use super::run::TrainResult;
+use crate::dataset::Description;
 use crate::error::{Error, Result};
 use crate::files::lock::{LOCK_NAME, Lock};
 use crate::files::{checksums, unfinished};
@@ -43,8 +44,14 @@ pub(crate) struct RunInfo {
     pub recordings: Vec<PathBuf>,
     /// Memory for decoded images, in MiB.
     pub cache_mib: usize,
+    /// What the user said about the recordings.
+    #[serde(default, skip_serializing_if = "Description::is_empty")]
+    pub said: Description,
     /// Hash over the rows of both sides: the recordings must not change during a run.
     pub rows_hash: String,
+    /// Hash over their pictures.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub pictures_hash: String,
     /// What the run took over from the model `from.safetensors`; absent for a fresh start.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub transfer: Option<Transfer>,

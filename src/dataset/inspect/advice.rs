@@ -2,7 +2,7 @@
 
 use super::suspicious::Suspicion;
 use super::{Pictures, Report, Steering};
-use crate::dataset::recording::{Kind, View};
+use crate::dataset::recording::View;
 use crate::dataset::unusable::Reason;
 
 /// Share of labels that are exactly zero above which straight frames crowd out the bends.
@@ -27,7 +27,7 @@ pub fn advice(report: &Report) -> Vec<String> {
     let mut advice = Vec::new();
     advice.extend(about_unusable(report));
     if let Some(steering) = &report.steering {
-        about_labels(report.kind, steering, &mut advice);
+        about_labels(report.format_cameras > 1, steering, &mut advice);
     }
     about_rows(report, &mut advice);
     if let Some(pictures) = &report.pictures {
@@ -49,16 +49,20 @@ fn about_unusable(report: &Report) -> impl Iterator<Item = String> + '_ {
         let remedy = match reason {
             Reason::ImageMissing => "copy the whole folder IMG beside the log, or record again",
             Reason::ImageTruncated | Reason::NotAnImage => "copy these images again; the disk may have been full",
-            Reason::LabelOutOfRange => "steering must be in [-1, 1]; divide degrees by the full-lock angle",
+            Reason::NotAFile => "only regular files are read: put pictures there",
+            Reason::LabelOutOfRange => "steering must be in [-1, 1]; say --unit if it is in another unit",
             Reason::Ambiguous => "write the log with decimal points, or with a separator that is no comma",
-            Reason::TooFewFields | Reason::TooManyFields | Reason::NotANumber => "mend or delete these lines",
+            Reason::TooFewFields | Reason::TooManyFields => {
+                "mend or delete these lines; say with --columns what stands where if the log has other columns"
+            }
+            Reason::NotANumber => "mend or delete these lines",
         };
         let rows = if tally.rows == 1 { "row" } else { "rows" };
         format!("{} {rows} left out, {}: {remedy}", tally.rows, reason.text())
     })
 }
 
-fn about_labels(kind: Kind, steering: &Steering, advice: &mut Vec<String>) {
+fn about_labels(simulated: bool, steering: &Steering, advice: &mut Vec<String>) {
     let zeros = steering.zero_share;
     let rows: usize = steering.histogram.iter().sum();
     if zeros > 0.99 {
@@ -95,7 +99,7 @@ fn about_labels(kind: Kind, steering: &Steering, advice: &mut Vec<String>) {
             100.0 * steering.full_lock_share
         ));
     }
-    if kind == Kind::Udacity && rows > 200 && (steering.distinct as f64) < FEW_LABELS * rows as f64 {
+    if simulated && rows > 200 && (steering.distinct as f64) < FEW_LABELS * rows as f64 {
         advice.push(format!(
             "only {} different labels, as a keyboard gives them: mouse or gamepad give smoother ones",
             steering.distinct
@@ -116,7 +120,7 @@ fn about_rows(report: &Report, advice: &mut Vec<String>) {
             100.0 * share
         ));
     }
-    if report.kind == Kind::Udacity && report.usable > 0 && !report.cameras.contains(&View::Left) {
+    if report.format_cameras > 1 && report.usable > 0 && !report.cameras.contains(&View::Left) {
         advice.push("no side cameras: a car off its line is never seen, so record ways back to it".into());
     }
     if report.gaps.count as f64 > 0.01 * report.usable as f64 && report.gaps.count > 2 {

@@ -31,6 +31,8 @@ const SAME_LEVELS: f64 = 0.25;
 /// One frame of the centre camera.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Frame {
+    /// Height and width of the picture.
+    pub size: [usize; 2],
     /// Mean grey level, 0 to 255.
     pub brightness: f32,
     /// How fast what is far away moves to the left, in widths of the picture per second, up to the next frame of the session:
@@ -92,7 +94,7 @@ fn look_at(recording: &Recording, first: usize, end: usize) -> Vec<Option<(u64, 
             let frozen = pair.is_some_and(|(before, sketch)| before.is_same(sketch));
             found.push(sketch.as_ref().map(|sketch| {
                 let brightness = sketch.cells.iter().sum::<f32>() / sketch.cells.len() as f32;
-                (sketch.hash, Frame { brightness, turn: None, frozen, copy_of: None })
+                (sketch.hash, Frame { size: sketch.size, brightness, turn: None, frozen, copy_of: None })
             }));
         }
         before = sketch;
@@ -103,6 +105,7 @@ fn look_at(recording: &Recording, first: usize, end: usize) -> Vec<Option<(u64, 
 /// What is kept of a picture to compare it with its neighbours.
 struct Sketch {
     hash: u64,
+    size: [usize; 2],
     details: Vec<f32>,
     cells: Vec<f32>,
 }
@@ -114,6 +117,7 @@ impl Sketch {
         let [top, bottom] = FAR.map(|share| (share * image.height as f64) as usize);
         Sketch {
             hash: hasher.finish(),
+            size: [image.height, image.width],
             details: details(&means(image, top..bottom.max(top + 1), 1, COLUMNS)),
             cells: means(image, 0..image.height, CELLS[1], CELLS[0]),
         }
@@ -133,10 +137,7 @@ struct Eye {
 
 impl Eye {
     fn look(&mut self, recording: &Recording, row: usize) -> Option<Sketch> {
-        use std::io::Read as _;
-        let path = recording.image_path(row, View::Centre)?;
-        self.file.clear();
-        std::fs::File::open(path).ok()?.read_to_end(&mut self.file).ok()?;
+        recording.read_picture(row, View::Centre, &mut self.file).ok()?;
         decode_rgb(&self.file, &mut self.image).ok()?;
         Some(Sketch::of(&self.file, &self.image))
     }

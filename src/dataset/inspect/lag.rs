@@ -111,8 +111,13 @@ mod tests {
         let labels: Vec<f32> = (0..400).map(label).collect();
         let recording = recording_of(&labels, 100);
         for delay in [-3, 0, 2] {
-            let frame =
-                |i: isize| Frame { brightness: 90.0, turn: Some(0.8 * label(i - delay)), frozen: false, copy_of: None };
+            let frame = |i: isize| Frame {
+                size: [160, 320],
+                brightness: 90.0,
+                turn: Some(0.8 * label(i - delay)),
+                frozen: false,
+                copy_of: None,
+            };
             let frames: Vec<_> = (0..400).map(|i| Some(frame(i))).collect();
             let lag = Lag::of(&recording, &frames).unwrap();
             assert!((lag.ms - (100.0 * delay as f64 + 50.0)).abs() < 12.0, "{delay}: {lag:?}");
@@ -128,7 +133,8 @@ mod tests {
         let recording = recording_of(&labels, 100);
         let turn =
             |i: u32| label(i as f32 - 5.0) + 0.02 * ((i.wrapping_mul(2_654_435_761) >> 16) as f32 / 65_536.0 - 0.5);
-        let frame = |i| Some(Frame { brightness: 90.0, turn: Some(turn(i)), frozen: false, copy_of: None });
+        let frame =
+            |i| Some(Frame { size: [160, 320], brightness: 90.0, turn: Some(turn(i)), frozen: false, copy_of: None });
         let frames: Vec<_> = (0..600).map(frame).collect();
         assert_eq!(Lag::of(&recording, &frames), None);
     }
@@ -138,7 +144,7 @@ mod tests {
         let labels: Vec<f32> = (0..400).map(|i| (i as f32 * 0.21).sin() * 0.4).collect();
         let recording = recording_of(&labels, 100);
         let noise = |i: u32| (i.wrapping_mul(2_654_435_761) >> 16) as f32 / 65_536.0 - 0.5;
-        let frame = |turn| Some(Frame { brightness: 90.0, turn, frozen: false, copy_of: None });
+        let frame = |turn| Some(Frame { size: [160, 320], brightness: 90.0, turn, frozen: false, copy_of: None });
         let frames: Vec<_> = (0..400).map(|i| frame(Some(noise(i)))).collect();
         assert_eq!(Lag::of(&recording, &frames), None);
         assert_eq!(Lag::of(&recording, &[frame(None); 400]), None);

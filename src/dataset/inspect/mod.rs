@@ -6,13 +6,17 @@ mod lag;
 mod suspicious;
 
 use crate::Result;
-use crate::dataset::load::{ImageCheck, load_with};
-use crate::dataset::recording::{Kind, Recording, Row, View};
-use crate::dataset::unusable::Unusable;
+use crate::dataset::description::Description;
+use crate::dataset::load::load_with;
+use crate::dataset::recording::{Recording, Row, View};
+use crate::dataset::rows::ImageCheck;
+use crate::dataset::unusable::{Reason, Unusable};
 use crate::observer::{Observer, Progress};
+use crate::text::escaped;
 pub use frames::Frame;
 pub use lag::Lag;
 use serde::Serialize;
+use std::collections::BTreeMap;
 use std::fmt::{self, Write};
 use std::path::Path;
 pub use suspicious::{STANDING_MPH, Stretch, Suspicion, contradiction, seen_steering};
@@ -37,8 +41,14 @@ const LISTED: usize = 10;
 pub struct Report {
     /// What was inspected.
     pub path: String,
-    /// Who wrote it.
-    pub kind: Kind,
+    /// Name of its format in JSON, such as `udacity` or `tub`.
+    pub kind: &'static str,
+    /// Name of its format for people.
+    #[serde(skip)]
+    pub format: &'static str,
+    /// Cameras that recordings of its format have.
+    #[serde(skip)]
+    pub format_cameras: usize,
     /// Rows of the log.
     pub rows: usize,
     /// Rows that can be used for training.
@@ -59,6 +69,10 @@ pub struct Report {
     pub cameras: Vec<View>,
     /// Height and width of the first image.
     pub image_size: Option<[usize; 2]>,
+    /// The sizes of the centre camera's pictures, the most frequent first.
+    pub sizes: Vec<Size>,
+    /// Whether the labels look like shares of full lock, or the user has said what they are.
+    pub labels_believed: bool,
     /// The labels; `None` without rows.
     pub steering: Option<Steering>,
     /// Smallest, mean and largest throttle, where it was recorded.
@@ -127,6 +141,17 @@ pub struct Session {
     pub length_s: f64,
 }
 
+/// Pictures of one size.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+pub struct Size {
+    /// Height in pixels.
+    pub height: usize,
+    /// Width in pixels.
+    pub width: usize,
+    /// Their number.
+    pub pictures: usize,
+}
+
 /// What the labels look like.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Steering {
@@ -170,15 +195,15 @@ impl Spread {
     }
 }
 
-/// Reads the recording at `path`, looks at its pictures and describes it. Where no image can be read, the log alone is
-/// described. `observer` is told the share of the pictures that is done.
+/// Reads the recording at `path`, of which the user says `said`, looks at its pictures and describes it. Where no image can be
+/// read, the log alone is described. `observer` is told the share of the pictures that is done.
 ///
 /// # Errors
-/// As [`super::load`]; the observer's own.
-pub fn inspect(path: &Path, observer: &mut (dyn Observer<Progress> + Send)) -> Result<Inspection> {
-    let checked = load_with(path, ImageCheck::Verify)?;
+/// As [`load_with`](super::load_with); the observer's own.
+pub fn inspect(path: &Path, said: &Description, observer: &mut (dyn Observer<Progress> + Send)) -> Result<Inspection> {
+    let checked = load_with(path, said, ImageCheck::Verify)?;
     if checked.rows.is_empty() && checked.total_rows() > 0 {
-        let log_alone = load_with(path, ImageCheck::Skip)?;
+        let log_alone = load_with(path, said, ImageCheck::Skip)?;
         if !log_alone.rows.is_empty() {
             let mut report = describe(path, &log_alone, &[]);
             report.notices.insert(0, "no row has its images; the figures are those of the log alone".into());
@@ -193,6 +218,37 @@ pub fn inspect(path: &Path, observer: &mut (dyn Observer<Progress> + Send)) -> R
     Ok(Inspection { recording: checked, frames, report })
 }
 
+/// Counts rows whose centre picture cannot be decoded as unusable.
+fn without_damaged(recording: &Recording, frames: &[Option<Frame>]) -> Unusable {
+    let mut unusable = recording.unusable.clone();
+    for (row, _) in frames.iter().enumerate().filter(|(_, frame)| frame.is_none()) {
+        let name = recording.image_path(row, View::Centre).unwrap_or_default();
+        unusable.add(Reason::ImageTruncated, || {
+            format!("line {}: {} cannot be decoded", recording.rows[row].line, escaped(&name.display().to_string()))
+        });
+    }
+    unusable
+}
+
+/// The sizes of the pictures, the most frequent first.
+fn sizes(frames: &[Option<Frame>]) -> Vec<Size> {
+    let mut counts = BTreeMap::new();
+    frames.iter().flatten().for_each(|frame| *counts.entry(frame.size).or_insert(0) += 1);
+    let mut sizes: Vec<Size> =
+        counts.into_iter().map(|([height, width], pictures)| Size { height, width, pictures }).collect();
+    sizes.sort_by_key(|size| std::cmp::Reverse(size.pictures));
+    sizes
+}
+
+/// `value` with `decimals`, and no sign before zero.
+fn fixed(value: f64, decimals: usize) -> String {
+    let text = format!("{value:.decimals$}");
+    match text.strip_prefix('-') {
+        Some(zero) if zero.bytes().all(|byte| matches!(byte, b'0' | b'.')) => zero.to_owned(),
+        _ => text,
+    }
+}
+
 fn describe(path: &Path, recording: &Recording, frames: &[Option<Frame>]) -> Report {
     let rows = &recording.rows;
     let lag = Lag::of(recording, frames);
@@ -205,10 +261,12 @@ fn describe(path: &Path, recording: &Recording, frames: &[Option<Frame>]) -> Rep
     });
     let mut report = Report {
         path: path.display().to_string(),
-        kind: recording.kind,
+        kind: recording.format.id,
+        format: recording.format.name,
+        format_cameras: recording.format.cameras,
         rows: recording.total_rows(),
-        usable: rows.len(),
-        unusable: recording.unusable.clone(),
+        usable: rows.len() - frames.iter().filter(|frame| frame.is_none()).count(),
+        unusable: without_damaged(recording, frames),
         sessions: sessions.collect(),
         driven_s: recording.driven_s(),
         span_s: span_ms as f64 / 1000.0,
@@ -224,7 +282,9 @@ fn describe(path: &Path, recording: &Recording, frames: &[Option<Frame>]) -> Rep
         gaps: gaps(recording),
         pictures: describe_pictures(recording, frames, lag),
         suspicious: suspicious::find(recording, frames, lag),
-        notices: recording.notices.clone(),
+        notices: recording.unit_trouble().map(str::to_owned).into_iter().chain(recording.notices.clone()).collect(),
+        labels_believed: recording.unit_trouble().is_none(),
+        sizes: sizes(frames),
         advice: Vec::new(),
     };
     report.advice = advice::advice(&report);
@@ -299,16 +359,12 @@ fn describe_steering(rows: &[Row]) -> Option<Steering> {
 
 impl fmt::Display for Report {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let kind = match self.kind {
-            Kind::Udacity => "Udacity driving log",
-            Kind::Tub => "donkeycar tub",
-        };
-        writeln!(f, "{}: {kind}", self.path)?;
+        writeln!(f, "{}: {}", self.path, self.format)?;
         writeln!(f, "rows      {} of {} usable", self.usable, self.rows)?;
         for (reason, tally) in &self.unusable.0 {
             writeln!(f, "          {} left out: {}", tally.rows, reason.text())?;
             for example in &tally.examples {
-                writeln!(f, "            {example}")?;
+                writeln!(f, "            {}", escaped(example))?;
             }
         }
         let rate = self.rate_hz.map_or(String::new(), |hz| format!(", {hz:.1} rows/s"));
@@ -329,16 +385,24 @@ impl fmt::Display for Report {
         }
         let cameras: Vec<&str> = self.cameras.iter().map(|camera| camera.name()).collect();
         let cameras = if cameras.is_empty() { "no images".to_owned() } else { cameras.join(", ") };
-        let size = self.image_size.map_or(String::new(), |[h, w]| format!("; {w}x{h} pixels"));
+        let size = match &self.sizes[..] {
+            [] | [_] => self.image_size.map_or(String::new(), |[h, w]| format!("; {w}x{h} pixels")),
+            sizes => {
+                let of = |Size { height, width, pictures }: &Size| format!("{pictures} of {width}x{height}");
+                format!("; pictures of {} sizes: {}", sizes.len(), sizes.iter().map(of).collect::<Vec<_>>().join(", "))
+            }
+        };
         writeln!(f, "cameras   {cameras}{size}")?;
         for (name, spread, unit) in [("throttle", self.throttle, ""), ("speed", self.speed_mph, " mph")] {
             if let Some(Spread { min, mean, max }) = spread {
-                writeln!(f, "{name:<9} {min:.2} to {max:.2}{unit}, mean {mean:.2}")?;
+                let [min, mean, max] = [min, mean, max].map(|value| fixed(value, 2));
+                writeln!(f, "{name:<9} {min} to {max}{unit}, mean {mean}")?;
             }
         }
         if let Some(steering) = &self.steering {
             let Steering { spread: Spread { min, mean, max }, deviation, zero_share, full_lock_share, .. } = steering;
-            writeln!(f, "steering  {min:.3} to {max:.3}, mean {mean:.4}, standard deviation {deviation:.4}")?;
+            let (min, mean, max) = (fixed(*min, 3), fixed(*mean, 4), fixed(*max, 3));
+            writeln!(f, "steering  {min} to {max}, mean {mean}, standard deviation {deviation:.4}")?;
             let (zero, lock) = (100.0 * zero_share, 100.0 * full_lock_share);
             writeln!(
                 f,
@@ -361,7 +425,9 @@ impl fmt::Display for Report {
             match lag {
                 Some(Lag { ms, correlation, .. }) => writeln!(
                     f,
-                    "          they follow the labels by {ms:.0} ms (correlation of steering and movement {correlation:.2})"
+                    "          they follow the labels by {} ms (correlation of steering and movement {})",
+                    fixed(*ms, 0),
+                    fixed(*correlation, 2)
                 )?,
                 None => writeln!(
                     f,
@@ -391,7 +457,7 @@ fn bars(histogram: &[usize]) -> String {
     let last = (0..histogram.len()).rfind(filled).unwrap_or(0);
     let mut text = String::new();
     for (i, &count) in histogram.iter().enumerate().take(last + 1).skip(first) {
-        let centre = i as f64 / 10.0 - 1.0;
+        let centre = (i as f64 - 10.0) / 10.0;
         let bar = "#".repeat((count * BAR).div_ceil(most));
         // Writing to a string cannot fail.
         let _ = writeln!(text, "{}", format!("          {centre:+.1} {count:>7} {bar}").trim_end());
@@ -444,7 +510,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("log.csv");
         std::fs::write(&path, "c.jpg,l.jpg,r.jpg,0.5,1,0,9\nc.jpg,l.jpg,r.jpg,x,1,0,9\n").unwrap();
-        let report = inspect(&path, &mut Unobserved).unwrap().report;
+        let report = inspect(&path, &Description::default(), &mut Unobserved).unwrap().report;
         let json = serde_json::to_value(&report).unwrap();
         assert_eq!((json["rows"].as_u64(), json["usable"].as_u64()), (Some(2), Some(0)));
         assert_eq!(json["unusable"]["not-a-number"]["rows"], 1);
@@ -458,11 +524,11 @@ mod tests {
         let Some(root) = recordings_folder() else { return };
         for (name, rows) in [("bydavy-mixed", 150), ("jwasham12-track2-mac", 150), ("spgitmonish-own-header", 149)] {
             let path = root.join("csv-variants").join(format!("{name}.csv"));
-            let report = inspect(&path, &mut Unobserved).unwrap().report;
+            let report = inspect(&path, &Description::default(), &mut Unobserved).unwrap().report;
             assert_eq!((report.rows, report.usable), (rows, 0), "{name}");
             assert!(report.steering.is_some());
         }
-        let lake = inspect(&root.join("lake-sample"), &mut Unobserved).unwrap().report;
+        let lake = inspect(&root.join("lake-sample"), &Description::default(), &mut Unobserved).unwrap().report;
         assert!((lake.steering.unwrap().zero_share - 0.56).abs() < 0.01);
         assert_eq!(lake.image_size, Some([160, 320]));
         let pictures = lake.pictures.unwrap();

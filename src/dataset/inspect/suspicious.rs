@@ -122,7 +122,7 @@ mod tests {
     use crate::dataset::testing::recording_of;
 
     fn frame(turn: f32) -> Option<Frame> {
-        Some(Frame { brightness: 90.0, turn: Some(turn), frozen: false, copy_of: None })
+        Some(Frame { size: [160, 320], brightness: 90.0, turn: Some(turn), frozen: false, copy_of: None })
     }
 
     #[test]

@@ -17,8 +17,6 @@ use crate::picture::{RgbImage, decode::decode_rgb};
 use crate::{Error, Result};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
-use std::fs::File;
-use std::io::Read;
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 
 /// Everything that decides what batches look like.
@@ -269,6 +267,16 @@ impl Loader {
         (undecodable.len(), undecodable.values().take(3).cloned().collect())
     }
 
+    /// Whether more than a fifth of the images could not be decoded so far.
+    pub fn has_decayed(&self) -> bool {
+        lock(&self.undecodable).len() * 5 > self.images.len()
+    }
+
+    /// Number of samples in an epoch without the images that could not be decoded so far.
+    pub fn samples_used(&self) -> usize {
+        (self.images.len() - lock(&self.undecodable).len()) * self.variants()
+    }
+
     /// How many frames of this (validation) loader have a near twin in `training`. Frames are known once they were
     /// decoded, so this is to be asked after the first epoch.
     pub fn near_twins(&self, training: &Loader) -> NearTwins {
@@ -348,10 +356,9 @@ impl Loader {
         let path = self.recordings[usize::from(recording)].image_path(row as usize, camera).ok_or("no such image")?;
         let failed = |message: String| format!("{}: {message}", path.display());
         self.times.decode.time(|| {
-            file.clear();
-            File::open(&path)
-                .and_then(|mut input| input.read_to_end(file))
-                .map_err(|error| failed(error.to_string()))?;
+            self.recordings[usize::from(recording)]
+                .read_picture(row as usize, camera, file)
+                .map_err(|error| error.to_string())?;
             decode_rgb(file, decoded).map_err(failed)
         })?;
         if preprocessor.image_size() != [decoded.height, decoded.width] {

@@ -9,6 +9,7 @@ use crate::dataset::recording::{Recording, View};
 use crate::engine::random::{Purpose, rng, shuffle, unit};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
+use std::collections::{HashMap, HashSet};
 use std::ops::Range;
 
 /// Sessions of at least this length, in seconds, are cut; shorter ones go whole to one side.
@@ -129,6 +130,7 @@ pub fn split(
         SplitMode::RandomImages => split.by_images(recordings, samples, balance, seed),
     }
     if spec.mode == SplitMode::Blocks {
+        split.settle_copies(recordings);
         split.low_throttle_rows = [&mut split.training, &mut split.validation]
             .map(|side| drop_low_throttle(side, recordings, samples))
             .iter()
@@ -205,7 +207,9 @@ impl Split {
         for (i, recording) in recordings.iter().enumerate() {
             if !recording.times_plausible {
                 let path = recording.path.display();
-                self.notices.push(format!("{path}: blocks of time are counted at 20 Hz, time stamps are implausible"));
+                let hz = recording.rate_hz().unwrap_or(0.0);
+                self.notices
+                    .push(format!("{path}: blocks of time are counted at {hz:.0} Hz, time stamps are implausible"));
             }
             for session in &recording.sessions {
                 number += 1;
@@ -274,6 +278,40 @@ impl Split {
                 self.training.extend(item);
             }
         }
+    }
+
+    /// Rows that show the picture of an earlier row stay where that one stands, or are used on neither side: with a recording
+    /// that is there twice, each validation frame would stand on the training side too.
+    fn settle_copies(&mut self, recordings: &[Recording]) {
+        let mut first: HashMap<u64, (u16, u32)> = HashMap::new();
+        let mut copies: HashMap<(u16, u32), (u16, u32)> = HashMap::new();
+        for (i, recording) in recordings.iter().enumerate() {
+            for row in 0..recording.rows.len() {
+                let Some(hash) = recording.picture_hash(row) else { break };
+                let here = (i as u16, row as u32);
+                let earlier = *first.entry(hash).or_insert(here);
+                if earlier != here {
+                    copies.insert(here, earlier);
+                }
+            }
+        }
+        if copies.is_empty() {
+            return;
+        }
+        let places =
+            |side: &[Item]| -> HashSet<(u16, u32)> { side.iter().map(|item| (item.recording, item.row)).collect() };
+        let sides = [places(&self.training), places(&self.validation)];
+        let mut dropped = 0;
+        for (side, places) in [&mut self.training, &mut self.validation].into_iter().zip(&sides) {
+            let before = side.len();
+            side.retain(|item| copies.get(&(item.recording, item.row)).is_none_or(|earlier| places.contains(earlier)));
+            dropped += before - side.len();
+        }
+        self.notices.push(format!(
+            "{} rows show the same picture as an earlier row (the log, or a recording, is there twice, or the car stands): {dropped} \
+             of them are used on neither side, so that no picture stands on both",
+            copies.len()
+        ));
     }
 
     fn by_rows(&mut self, recordings: &[Recording], samples: &SampleSpec, seed: u64) {

@@ -55,7 +55,7 @@ pub fn write(path: &Path) -> Result<PathBuf> {
 fn page(folder: &RunFolder, path: &Path) -> Result<String> {
     let (info, recipe, history) = (folder.info()?, folder.recipe()?, folder.history()?);
     let pilot = Pilot::load(&folder.model())?;
-    let data = Data::prepare(&info.recordings, &recipe, info.seed, 0)?;
+    let data = Data::prepare(&info.recordings, &info.said, &recipe, info.seed, 0)?;
     let lead = format!("Recipe {}: {}", recipe.name, recipe.about);
     let mut page = Page::new(&path.display().to_string(), &lead);
     let drives = drives::read(path)?;
@@ -181,7 +181,9 @@ fn answers(pilot: &Pilot, data: &Data) -> Vec<Answer> {
     let answer = |pilot: &mut Pilot, item: Item| {
         let (index, row) = (usize::from(item.recording), item.row as usize);
         let recording = &data.recordings()[index];
-        let steering = pilot.steer_file(&recording.image_path(row, View::Centre)?).ok()?;
+        let mut bytes = Vec::new();
+        recording.read_picture(row, View::Centre, &mut bytes).ok()?;
+        let steering = pilot.steer_encoded(&bytes).ok()?;
         let prediction = Prediction {
             steering,
             label: recording.rows[row].steering,

@@ -6,7 +6,7 @@ use super::film::{Video, ended_early};
 use super::onlooker::Onlooker;
 use super::painter::{Captions, FilmFrame, FilmScales, Painter};
 use super::summary::VideoSummary;
-use crate::dataset::{self, Recording, View};
+use crate::dataset::{Recording, View};
 use crate::error::{Error, Result};
 use crate::observer::{Observer, Progress};
 use crate::picture::decode::decode_rgb;
@@ -15,26 +15,25 @@ use crate::simulator::car::dynamics::MAX_STEER_DEG;
 /// Pictures a second where no session has two rows.
 const LONE_ROW_HZ: f64 = 20.0;
 
-/// Writes the video of the recording `path` to the new file `out`: `fps` pictures a second, or as many as were recorded.
+/// Writes the video of `recording` to the new file `out`: `fps` pictures a second, or as many as were recorded.
 /// Sessions follow each other without the time between them. `observer` is told the share that is done. If it
 /// returns [`Error::Interrupted`], what there is by then is written, and the second value is `true`.
 ///
 /// # Errors
 ///
-/// As [`dataset::load`] and [`Video::create`]; [`Error::Io`] and [`Error::Data`] for a picture that cannot be read.
+/// As [`Recording::require_usable`] and [`Video::create`]; [`Error::Io`] and [`Error::Data`] for a picture that cannot be read.
 pub fn film(
-    path: &Path,
+    recording: &Recording,
     out: &Path,
     mut onlooker: Option<Onlooker>,
     fps: Option<f64>,
     observer: &mut dyn Observer<Progress>,
 ) -> Result<(VideoSummary, bool)> {
-    let recording = dataset::load(path)?;
     recording.require_usable()?;
     let full_lock_deg = onlooker.as_ref().map_or(MAX_STEER_DEG, Onlooker::full_lock_deg);
     let own = recording.rate_hz().unwrap_or(LONE_ROW_HZ);
     let names = Captions {
-        title: name(path),
+        title: name(&recording.path),
         subtitle: format!("recording, {} rows, {own:.3} Hz", recording.rows.len()).replace(".000", ""),
         model: onlooker.as_ref().map(|_| "model"),
         reference: "driver",
@@ -52,7 +51,7 @@ pub fn film(
         for row in session.clone() {
             let at = &recording.rows[row];
             // One bad picture does not cost the video; without any good one there is none.
-            if let Err(error) = read(&recording, row, &mut frame) {
+            if let Err(error) = read(recording, row, &mut frame) {
                 unreadable += 1;
                 if unreadable == recording.rows.len() {
                     return Err(error);
@@ -85,9 +84,8 @@ fn name(path: &Path) -> String {
 }
 
 fn read(recording: &Recording, row: usize, frame: &mut FilmFrame) -> Result<()> {
-    let path = recording.image_path(row, View::Centre);
-    let path =
-        path.ok_or_else(|| Error::data(&recording.path, format!("row {row} has no picture of the centre camera")))?;
-    let bytes = std::fs::read(&path).map_err(Error::io(&path))?;
-    decode_rgb(&bytes, &mut frame.picture).map_err(|message| Error::data(&path, message))
+    let mut bytes = Vec::new();
+    recording.read_picture(row, View::Centre, &mut bytes)?;
+    let place = || recording.image_path(row, View::Centre).unwrap_or_default();
+    decode_rgb(&bytes, &mut frame.picture).map_err(|message| Error::data(place(), message))
 }

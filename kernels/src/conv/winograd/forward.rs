@@ -19,8 +19,8 @@ pub(crate) struct Forward {
 impl Forward {
     /// The forward pass of `shape`, or `None` where the direct algorithm is as fast.
     pub fn new(shape: ConvShape, isa: Isa) -> Option<Forward> {
-        let most = |rows: usize, planes: usize, positions: usize| BUDGET / ((rows + 2) * planes * positions);
-        let (input, taps) = InputPoints::new(shape, most)?;
+        let max_tiles = |rows: usize, planes: usize, positions: usize| BUDGET / ((rows + 2) * planes * positions);
+        let (input, taps) = InputPoints::new(shape, max_tiles)?;
         if taps.len() < MIN_TAPS {
             return None;
         }

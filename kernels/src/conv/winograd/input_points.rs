@@ -57,9 +57,9 @@ pub(super) struct InputPoints {
 }
 
 impl InputPoints {
-    /// The points of `shape` and the taps on them, or `None` where the direct algorithm is as fast. `most` gives the number of
+    /// The points of `shape` and the taps on them, or `None` where the direct algorithm is as fast. `max_tiles` gives the number of
     /// tiles of a strip from the rows of a tile, the planes of a point and the positions of a tile.
-    pub fn new(shape: ConvShape, most: impl FnOnce(usize, usize, usize) -> usize) -> Option<(InputPoints, Taps)> {
+    pub fn new(shape: ConvShape, max_tiles: impl FnOnce(usize, usize, usize) -> usize) -> Option<(InputPoints, Taps)> {
         let ConvShape { c, kh, kw, stride_h, stride_w, .. } = shape;
         let (row_phases, column_phases) = (stride_h.min(kh), stride_w.min(kw));
         let rows_of = |phase: usize| (kh - phase).div_ceil(stride_h);
@@ -69,8 +69,8 @@ impl InputPoints {
         let rows = rows_per_tile(shape.out_h(), &(0..row_phases).map(rows_of).collect::<Vec<_>>(), shape.out_h() * kh)?;
         let layout = Layout::new(shape);
         let planes = c * row_phases * column_phases;
-        let most = most(rows, planes, layout.pitch);
-        let strips = Strips::new(rows, shape.out_h(), layout.pitch, kw.div_ceil(stride_w), most);
+        let max_tiles = max_tiles(rows, planes, layout.pitch);
+        let strips = Strips::new(rows, shape.out_h(), layout.pitch, kw.div_ceil(stride_w), max_tiles);
         let (mut offsets, mut weights, mut phases) = (Vec::new(), Vec::new(), Vec::new());
         for phase in 0..row_phases {
             let first = offsets.len();

@@ -34,11 +34,11 @@ pub(crate) struct WeightGradient {
 impl WeightGradient {
     /// The weight gradient of `shape`, or `None` where the direct algorithm is as fast.
     pub fn new(shape: ConvShape, isa: Isa) -> Option<WeightGradient> {
-        let most = |rows: usize, planes: usize, positions: usize| {
+        let max_tiles = |rows: usize, planes: usize, positions: usize| {
             let tile = (rows + 2) * (planes + shape.oc) * positions;
             (GRADIENT_BUDGET / tile).max(MIN_POSITIONS.div_ceil(positions))
         };
-        let (input, taps) = InputPoints::new(shape, most)?;
+        let (input, taps) = InputPoints::new(shape, max_tiles)?;
         let strips = &input.strips;
         let positions = strips.images * strips.per_strip * strips.pitch;
         (positions >= TOO_FEW_POSITIONS).then_some(WeightGradient { isa, input, taps })
