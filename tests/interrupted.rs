@@ -36,14 +36,14 @@ fn wait_for(path: &Path) {
 
 /// Trains a run of one epoch in `run`.
 fn finished_run() -> tempfile::TempDir {
-    let folder = folder_with_log(60);
+    let folder = folder_with_log(300);
     json(folder.path(), &[&QUICK[..], &["--out", "run"]].concat());
     folder
 }
 
 #[test]
 fn four_trainings_at_the_same_moment_each_get_their_folder() {
-    let folder = folder_with_log(60);
+    let folder = folder_with_log(300);
     let children: Vec<_> = (0..4).map(|_| spawn(folder.path(), &QUICK)).collect();
     for child in children {
         let output = child.wait_with_output().unwrap();
