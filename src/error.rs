@@ -88,10 +88,19 @@ pub enum Error {
 }
 
 impl Error {
-    /// An [`Error::Io`] at `path`; meant for `map_err`.
+    /// An [`Error::Io`] at `path`, or an [`Error::CannotWrite`] with the remedy where the disk is full or read-only; meant for
+    /// `map_err`.
     pub fn io(path: impl AsRef<Path>) -> impl FnOnce(std::io::Error) -> Error {
+        use std::io::ErrorKind::{FileTooLarge, QuotaExceeded, ReadOnlyFilesystem, StorageFull};
         let path = path.as_ref().to_path_buf();
-        move |source| Error::Io { path, source }
+        move |source| {
+            let remedy = match source.kind() {
+                StorageFull | QuotaExceeded | FileTooLarge => "make room on that disk, or name a place on another",
+                ReadOnlyFilesystem => "name a folder where you may write",
+                _ => return Error::Io { path, source },
+            };
+            Error::CannotWrite { path, source, remedy: remedy.into() }
+        }
     }
 
     /// An [`Error::Data`] in the file `path`.

@@ -5,6 +5,8 @@
 //! `training` (the [`TrainingRecord`]). One more tensor, `training_rows`, says which rows the model was trained on.
 
 use std::collections::HashMap;
+use std::fs::File;
+use std::io::Read as _;
 use std::path::Path;
 
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
@@ -12,7 +14,7 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use steersman_kernels::Isa;
 
-use crate::engine::network::{Network, Parameters};
+use crate::engine::network::{MAX_PARAMETERS, Network, Parameters};
 use crate::error::{Error, Result};
 use crate::files::atomic_file;
 use crate::recipe::Recipe;
@@ -123,7 +125,7 @@ impl Model {
     /// [`Error::Io`] if the file cannot be read; [`Error::Data`] if it is damaged, has been made by something else, or its
     /// tensors do not fit its recipe.
     pub fn load(path: &Path) -> Result<Model> {
-        let bytes = std::fs::read(path).map_err(Error::io(path))?;
+        let bytes = read_file(path)?;
         let (tensors, metadata) = read_tensors(path, &bytes)?;
         let version: FormatNumber = parse_metadata(path, &metadata)?;
         if version.format != FORMAT {
@@ -202,6 +204,8 @@ pub(crate) fn write_tensors(path: &Path, tensors: &[StoredTensor], metadata: Str
         let view = TensorView::new(tensor.dtype, tensor.shape.clone(), &tensor.bytes);
         (tensor.name.as_str(), view.expect("a stored tensor has as many bytes as its shape says"))
     });
+    let metadata =
+        sealed(metadata, tensors.iter().map(|tensor| (&*tensor.name, tensor.dtype, &*tensor.shape, &*tensor.bytes)));
     // One entry only: the order of several would be that of a hash map, and the same model another file each time.
     let info = HashMap::from([(METADATA_KEY.to_string(), metadata)]);
     let bytes = safetensors::serialize(views, Some(info)).map_err(|e| Error::data(path, e.to_string()))?;
@@ -210,13 +214,122 @@ pub(crate) fn write_tensors(path: &Path, tensors: &[StoredTensor], metadata: Str
 
 /// Tensors and metadata of a safetensors file of ours.
 pub(crate) fn read_tensors<'a>(path: &Path, bytes: &'a [u8]) -> Result<(SafeTensors<'a>, String)> {
-    let damaged =
-        |e: safetensors::SafeTensorError| Error::data(path, format!("is no safetensors file, or is damaged: {e}"));
-    let (_, header) = SafeTensors::read_metadata(bytes).map_err(damaged)?;
-    let tensors = SafeTensors::deserialize(bytes).map_err(damaged)?;
+    let (_, header) = SafeTensors::read_metadata(bytes).map_err(damaged(path))?;
+    let tensors = SafeTensors::deserialize(bytes).map_err(damaged(path))?;
     let metadata = header.metadata().as_ref().and_then(|info| info.get(METADATA_KEY)).cloned();
     let missing = || Error::data(path, format!("has no `{METADATA_KEY}` metadata: it was not written by steersman"));
-    Ok((tensors, metadata.ok_or_else(missing)?))
+    let metadata = metadata.ok_or_else(missing)?;
+    let Some((content, digest)) = unsealed(&metadata) else { return Ok((tensors, metadata)) };
+    let all = tensors.iter().collect::<Vec<_>>();
+    let parts = all.iter().map(|(name, tensor)| (*name, tensor.dtype(), tensor.shape(), tensor.data()));
+    if digest_of(&content, parts) != digest {
+        let remedy = "take a copy that is whole, or train again";
+        return Err(Error::data(path, format!("is damaged: its content does not fit its digest; {remedy}")));
+    }
+    Ok((tensors, content))
+}
+
+/// What stands before the digest at the end of the metadata.
+const SEAL: &str = ",\"sha256\":\"";
+
+/// The JSON object `metadata` with the digest of itself and of the tensors as its last entry.
+fn sealed<'a>(metadata: String, tensors: impl Iterator<Item = TensorParts<'a>>) -> String {
+    let digest = digest_of(&metadata, tensors);
+    match metadata.strip_suffix('}') {
+        Some(open) if !open.ends_with('{') => format!("{open}{SEAL}{digest}\"}}"),
+        _ => metadata,
+    }
+}
+
+/// The metadata without its digest, and the digest; `None` for a file of an earlier version, which has none.
+fn unsealed(metadata: &str) -> Option<(String, &str)> {
+    let (open, digest) = metadata.strip_suffix("\"}")?.rsplit_once(SEAL)?;
+    Some((format!("{open}}}"), digest))
+}
+
+/// Name, type, shape and bytes of a tensor.
+type TensorParts<'a> = (&'a str, Dtype, &'a [usize], &'a [u8]);
+
+/// SHA-256 over the metadata and the tensors, whatever their order.
+fn digest_of<'a>(metadata: &str, tensors: impl Iterator<Item = TensorParts<'a>>) -> String {
+    let mut tensors: Vec<_> = tensors.collect();
+    tensors.sort_by_key(|(name, ..)| *name);
+    let mut hash = Sha256::new();
+    let mut field = |bytes: &[u8]| {
+        hash.update((bytes.len() as u64).to_le_bytes());
+        hash.update(bytes);
+    };
+    field(metadata.as_bytes());
+    for (name, dtype, shape, bytes) in tensors {
+        field(name.as_bytes());
+        field(format!("{dtype:?} {shape:?}").as_bytes());
+        field(bytes);
+    }
+    hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+/// A notice about the model or checkpoint `path` if it has no digest, because an earlier version wrote it.
+///
+/// # Errors
+///
+/// As [`Model::load`] for a file that is no model.
+pub fn notice_without_digest(path: &Path) -> Result<Option<String>> {
+    let bytes = read_file(path)?;
+    let (_, header) = SafeTensors::read_metadata(&bytes).map_err(damaged(path))?;
+    let metadata = header.metadata().as_ref().and_then(|info| info.get(METADATA_KEY));
+    Ok(metadata.filter(|metadata| unsealed(metadata).is_none()).map(|_| {
+        format!(
+            "{}: an earlier version wrote this file, without a digest: damage to it may go unnoticed",
+            path.display()
+        )
+    }))
+}
+
+fn damaged(path: &Path) -> impl Fn(safetensors::SafeTensorError) -> Error {
+    move |e| Error::data(path, format!("is no safetensors file, or is damaged: {e}"))
+}
+
+/// Longest header of a file: names and shapes of the tensors, and the metadata.
+const MAX_HEADER_LEN: u64 = 4 << 20;
+
+/// Reads a safetensors file whose length is the one that its header says.
+pub(crate) fn read_file(path: &Path) -> Result<Vec<u8>> {
+    let refuse = |message: String| Err(Error::data(path, format!("is no safetensors file, or is damaged: {message}")));
+    let mut file = File::open(path).map_err(Error::io(path))?;
+    let len = file.metadata().map_err(Error::io(path))?.len();
+    let mut bytes = Vec::new();
+    (&mut file).take(8).read_to_end(&mut bytes).map_err(Error::io(path))?;
+    let Some(header_len) = bytes.first_chunk().map(|bytes| u64::from_le_bytes(*bytes)) else {
+        return refuse(format!("it has {len} bytes"));
+    };
+    if header_len > MAX_HEADER_LEN {
+        return refuse(format!("its header has {header_len} bytes, and at most {} MiB are read", MAX_HEADER_LEN >> 20));
+    }
+    (&mut file).take(header_len).read_to_end(&mut bytes).map_err(Error::io(path))?;
+    let Ok(header) = serde_json::from_slice::<HashMap<String, HeaderEntry>>(&bytes[8..]) else {
+        return refuse("its header cannot be read".into());
+    };
+    let end = header.values().filter_map(|entry| entry.data_offsets).map(|[_, end]| end).max().unwrap_or(0);
+    let expected = 8 + header_len + end.min(u64::MAX / 2);
+    if len != expected {
+        return refuse(format!("it has {len} bytes, and its header says {expected}"));
+    }
+    if end > MAX_TENSOR_BYTES {
+        let most = MAX_TENSOR_BYTES >> 20;
+        return refuse(format!("it has {} MiB of numbers, and at most {most} MiB are read", end >> 20));
+    }
+    bytes.reserve_exact(end as usize);
+    file.take(end).read_to_end(&mut bytes).map_err(Error::io(path))?;
+    Ok(bytes)
+}
+
+/// Most numbers that are read, bytes: the weights of the largest network four times, as a checkpoint has them, and the rows.
+const MAX_TENSOR_BYTES: u64 = 16 * MAX_PARAMETERS as u64 + (512 << 20);
+
+/// What the header says of a tensor; the metadata have no offsets.
+#[derive(Deserialize)]
+struct HeaderEntry {
+    data_offsets: Option<[u64; 2]>,
 }
 
 /// The tensor `name`.
@@ -310,6 +423,64 @@ mod tests {
         let metadata = r#"{"format": 99}"#.to_string();
         write_tensors(&path, &[], metadata).unwrap();
         assert!(load().contains("is a model of format 99; this program reads format 1"));
+    }
+
+    #[test]
+    fn a_flipped_bit_anywhere_is_an_error_that_names_the_file() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("m.safetensors");
+        model().save(&path).unwrap();
+        let bytes = std::fs::read(&path).unwrap();
+        let header_len = u64::from_le_bytes(*bytes.first_chunk().unwrap()) as usize;
+        // Every byte of the header, and some of the numbers. Spaces after the JSON say nothing.
+        let text_len = 8 + bytes[8..8 + header_len].trim_ascii_end().len();
+        for at in (0..text_len).chain((8 + header_len..bytes.len()).step_by(1009)) {
+            let mut flipped = bytes.clone();
+            flipped[at] ^= 1 << (at % 8);
+            std::fs::write(&path, flipped).unwrap();
+            let error = Model::load(&path).expect_err(&format!("byte {at}")).to_string();
+            assert!(error.contains("m.safetensors"), "{error}");
+        }
+        assert!(notice_without_digest(&path).is_ok());
+    }
+
+    #[test]
+    fn a_file_without_a_digest_still_loads_with_a_notice() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("m.safetensors");
+        model().save(&path).unwrap();
+        assert_eq!(notice_without_digest(&path).unwrap(), None);
+        let bytes = std::fs::read(&path).unwrap();
+        let header_len = u64::from_le_bytes(*bytes.first_chunk().unwrap()) as usize;
+        let header = String::from_utf8(bytes[8..8 + header_len].to_vec()).unwrap();
+        // As an earlier version wrote it: the same without the last entry of the metadata.
+        let seal = header.find(r#",\"sha256\":\""#).unwrap();
+        let old = format!("{}{}", &header[..seal], &header[seal + r#",\"sha256\":\"\""#.len() + 64..]);
+        let old_file = [&(old.len() as u64).to_le_bytes()[..], old.as_bytes(), &bytes[8 + header_len..]].concat();
+        std::fs::write(&path, old_file).unwrap();
+        assert_eq!(Model::load(&path).unwrap(), model());
+        assert!(notice_without_digest(&path).unwrap().unwrap().contains("m.safetensors: an earlier version"));
+    }
+
+    #[test]
+    fn a_file_is_not_read_whole_before_its_length_is_checked() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("m.safetensors");
+        let write = |header_len: u64, header: &str, len: u64| {
+            std::fs::write(&path, [&header_len.to_le_bytes()[..], header.as_bytes()].concat()).unwrap();
+            File::options().write(true).open(&path).unwrap().set_len(len).unwrap();
+            Model::load(&path).unwrap_err().to_string()
+        };
+        let gib = 1 << 30;
+        let huge = r#"{"a":{"dtype":"U8","shape":[8000000000],"data_offsets":[0,8000000000]}}"#;
+        for (header_len, header, len, words) in [
+            (80 << 20, "{", 100 << 20, "at most 4 MiB are read"),
+            (2, "{}", 4 * gib, "its header says 10"),
+            (huge.len() as u64, huge, 8 + huge.len() as u64 + 8_000_000_000, "MiB are read"),
+        ] {
+            let error = write(header_len, header, len);
+            assert!(error.contains("m.safetensors") && error.contains(words), "{error}");
+        }
     }
 
     #[test]

@@ -10,10 +10,11 @@ use steersman_kernels::Isa;
 use crate::dataset::preprocess::Preprocessor;
 use crate::engine::network::{Network, ObservationPlan, Parameters, Predictor};
 use crate::error::{Error, Result};
+use crate::files::limits::read_up_to;
 use crate::model_file::Model;
 use crate::picture::{
     RgbImage,
-    decode::{MAX_SIDE, decode_rgb_within},
+    decode::{MAX_FILE_LEN, MAX_SIDE, decode_rgb_within},
 };
 use crate::recipe::Recipe;
 
@@ -211,7 +212,7 @@ impl Pilot {
     ///
     /// [`Error::Io`] if it cannot be read, [`Error::Data`] if it is no image.
     pub fn steer_file(&mut self, path: &Path) -> Result<f32> {
-        let bytes = std::fs::read(path).map_err(Error::io(path))?;
+        let bytes = read_up_to(path, MAX_FILE_LEN, "a picture")?;
         self.steer_encoded(&bytes).map_err(|e| match e {
             Error::Codec(message) | Error::Input(message) => Error::data(path, message),
             other => other,

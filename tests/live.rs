@@ -286,3 +286,25 @@ fn a_port_that_is_taken_is_told_with_the_remedy_and_leaves_nothing_behind() {
     }
     assert!(entries(folder.path()).is_empty());
 }
+
+#[test]
+fn idle_connections_make_room_and_a_page_in_use_keeps_its_seat() {
+    let folder = tempfile::tempdir().unwrap();
+    random_model(&folder.path().join("model"), "lenet");
+    let served = serve(folder.path(), &["drive", "model", "--track", "lake", "--runs", "1", "--laps", "9", "--watch"]);
+    let mut page = Page::open(served.port);
+    page.next().unwrap();
+    let mut idle = Vec::new();
+    for _ in 0..45 {
+        idle.push(Page::open(served.port));
+        page.next().unwrap();
+    }
+    let mut late = Page::open(served.port);
+    late.next().unwrap();
+    page.next().unwrap();
+    assert!(
+        served.ask(&format!("GET / HTTP/1.1\r\nHost: 127.0.0.1:{}\r\n\r\n", served.port)).starts_with("HTTP/1.1 200")
+    );
+    served.interrupt();
+    assert_eq!(served.code(), Some(130));
+}

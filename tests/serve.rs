@@ -6,7 +6,7 @@ mod common;
 use std::io::{BufRead, BufReader, Write};
 use std::path::Path;
 use std::process::Stdio;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use common::command::{error, json, steersman};
 use common::served::{Client, SIMULATOR, Served, command, random_model, sample_jpeg, telemetry};
@@ -250,7 +250,9 @@ fn bad_telemetry_is_answered_so_that_the_car_does_not_wait_for_ever() {
         (good[..good.len() - 3].to_string(), "event that cannot be read"),
     ] {
         client.send(&bad);
-        assert_eq!(command(&client.next()), (steering, 0.0), "the wheel stays, the throttle is cut: {words}");
+        let (held, throttle) = command(&client.next());
+        // On a slow machine the time of holding may be over, and the car brakes.
+        assert!(held == steering && (throttle == 0.0 || throttle == -1.0), "the wheel stays: {words}: {throttle}");
         served.wait_until_it_says(words);
         client.send(&good);
         // On a slow machine the throttle is cut once more in between.
@@ -318,7 +320,7 @@ fn control_characters_of_a_client_are_not_shown() {
     client.send("2\u{1b}[2J\u{9b}\rend");
     assert_eq!(client.next(), "3\u{1b}[2J\u{9b}\rend");
     let said = served.wait_until_it_says("< 3");
-    assert!(said.contains("> 2\u{fffd}[2J\u{fffd}\u{fffd}end"), "{said:?}");
+    assert!(said.contains(r"> 2\u{1b}[2J\u{9b}\rend"), "{said:?}");
     let (_, said) = served.stop();
     assert!(!said.contains(['\u{1b}', '\u{9b}', '\r']), "{said:?}");
 }
@@ -489,4 +491,57 @@ fn bad_arguments_of_sim_are_errors_with_a_remedy() {
         assert_eq!(output.status.code(), Some(2), "{args:?}");
     }
     assert!(!Path::new(&folder.path().join("sim")).exists());
+}
+
+#[test]
+fn damaged_frames_hold_the_wheel_for_half_a_second_and_then_the_car_brakes() {
+    let folder = folder_with_model();
+    let served = serve(&folder, &[]);
+    let jpeg = sample_jpeg();
+    let mut client = served.connect_simulator();
+    let (steering, _) = turn(&mut client, 12.0, &jpeg);
+    let answered = Instant::now();
+    // A whole start, and an end marker behind half of the picture.
+    let damaged = [&jpeg[..jpeg.len() / 2], &[0xff, 0xd9]].concat();
+    let mut braked = None;
+    while braked.is_none() {
+        client.send(&telemetry(12.0, &damaged));
+        let (held, throttle) = command(&client.next());
+        assert_eq!(held, steering, "a damaged frame steers nothing");
+        assert!(throttle == 0.0 || throttle == -1.0, "{throttle}");
+        braked = (throttle < 0.0).then(|| answered.elapsed());
+        assert!(answered.elapsed() < Duration::from_secs(60), "it never brakes");
+    }
+    assert!(braked >= Some(Duration::from_millis(450)), "{braked:?}");
+    // The simulator would drive backwards if it braked a slow car.
+    client.send(&telemetry(3.0, &damaged));
+    assert_eq!(command(&client.next()), (steering, 0.0));
+    assert!(turn(&mut client, 12.0, &jpeg).1 > 0.0, "a good frame drives again");
+    served.stop();
+}
+
+#[test]
+fn a_damaged_model_is_refused_by_name_and_an_old_one_is_driven_with_a_notice() {
+    let folder = folder_with_model();
+    let path = folder.path().join("model");
+    let whole = std::fs::read(&path).unwrap();
+    let mut damaged = whole.clone();
+    // The lowest bit of a weight.
+    let at = damaged.len() - 1001;
+    damaged[at - at % 4] ^= 1;
+    std::fs::write(&path, damaged).unwrap();
+    for args in [&["serve", "model", "--port", "0"][..], &["drive", "model", "--track", "lake", "--runs", "1"]] {
+        let said = error(folder.path(), args);
+        assert!(said.contains("model: is damaged"), "{said}");
+    }
+    let header_len = u64::from_le_bytes(*whole.first_chunk().unwrap()) as usize;
+    let header = std::str::from_utf8(&whole[8..8 + header_len]).unwrap();
+    let seal = header.find(r#",\"sha256\":\""#).unwrap();
+    let end = seal + r#",\"sha256\":\"\""#.len() + 64;
+    let old = format!("{}{}", &header[..seal], &header[end..]);
+    let bytes = [&(old.len() as u64).to_le_bytes(), old.as_bytes(), &whole[8 + header_len..]].concat();
+    std::fs::write(&path, bytes).unwrap();
+    let served = serve(&folder, &[]);
+    assert!(served.said().contains("note: model: an earlier version wrote this file"), "{}", served.said());
+    served.stop();
 }

@@ -9,12 +9,12 @@ use super::recording_args::RecordingArgs;
 use super::replay::{self, ReplayArgs};
 use super::share_bar::ShareBar;
 use super::video::tell_video;
-use super::{pool, print, print_json, stop_on_ctrl_c};
+use super::{load_pilot, pool, print, print_json, stop_on_ctrl_c};
 use crate::dataset::held_out::trained_on_held_out;
 use crate::error::{Error, Result};
+use crate::files::limits::keep_elsewhere;
 use crate::files::new_folder::NewFolder;
-use crate::live::messages::Hello;
-use crate::live::{DEFAULT_PORT, Live, Watch};
+use crate::live::{DEFAULT_PORT, Hello, Live, Watch};
 use crate::observer::StopSignal;
 use crate::pilot::Pilot;
 use crate::report::charts::map;
@@ -159,9 +159,15 @@ pub fn run(args: DriveArgs) -> Result<()> {
     }
     let comparison = other.as_ref().map_or(Ok(Vec::new()), |other| compare(&result, other))?;
     // What was measured is told even if it cannot be saved.
-    let saved = folder.map_or(Ok(()), |folder| {
+    let save = |folder: NewFolder| {
         map::write(&track, &result, &folder)?;
         write_trajectories(&result, folder)
+    };
+    let saved = folder.map_or(Ok(()), |folder| {
+        save(folder).map_err(|cause| {
+            let again = |other: &Path| save(NewFolder::create(&other.join("drive"))?);
+            keep_elsewhere(cause, again, |other| format!("the drive is kept in {}", other.join("drive").display()))
+        })
     });
     let film = |video: DriveVideo| at_wheel.film(video, &track, &options, &args, &stop);
     if args.json {
@@ -206,7 +212,7 @@ impl Wheel {
         Ok(match name {
             "expert" => Wheel::Expert,
             "zero" => Wheel::Zero,
-            path => Wheel::Model(Box::new(Pilot::load(Path::new(path))?)),
+            path => Wheel::Model(Box::new(load_pilot(Path::new(path))?)),
         })
     }
 

@@ -9,13 +9,12 @@ use serde::Serialize;
 use steersman_kernels::Isa;
 
 use super::recording_args::RecordingArgs;
-use super::{or_dash, pool, print_json};
+use super::{load_model, or_dash, pool, print_json};
 use crate::dataset::held_out::trained_on_held_out;
 use crate::dataset::{Recording, View};
 use crate::error::{Error, Result};
 use crate::geometry::{GeometryEntry, LookAhead};
 use crate::metrics::{Metrics, Prediction};
-use crate::model_file::Model;
 use crate::pilot::Pilot;
 use crate::replay::{ReplayLog, usual_preset};
 
@@ -70,7 +69,7 @@ struct PathReport {
 }
 
 pub fn run(args: EvaluateArgs) -> Result<()> {
-    let model = Model::load(&args.model)?;
+    let model = load_model(&args.model)?;
     let trained_on: BTreeSet<u64> = model.training_rows.iter().copied().collect();
     let held_out = model.record.trained_on_held_out.clone();
     let full_lock_deg = model.recipe.full_lock_deg;

@@ -6,10 +6,9 @@ use clap::Args;
 use serde::Serialize;
 
 use super::share_bar::ShareBar;
-use super::{new_folder, pool, print, print_json, refuse_existing, stop_on_ctrl_c};
+use super::{load_pilot, new_folder, pool, print, print_json, refuse_existing, stop_on_ctrl_c};
 use crate::error::{Error, Result};
 use crate::files::atomic_file;
-use crate::pilot::Pilot;
 use crate::report::explain::counterfactual::{Counterfactuals, examine};
 use crate::report::explain::exhibits::{Exhibit, exhibits};
 use crate::report::explain::findings::Finding;
@@ -51,7 +50,7 @@ struct Answer<'a> {
 }
 
 pub fn run(args: ExplainArgs) -> Result<()> {
-    let pilot = Pilot::load(&args.model)?;
+    let pilot = load_pilot(&args.model)?;
     refuse_existing(&args.out)?;
     let footage = match &args.track {
         Some(track) => Footage::of_track(track, args.seed)?,

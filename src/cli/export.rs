@@ -5,12 +5,11 @@ use std::path::{Path, PathBuf};
 use clap::{Args, ValueEnum};
 use serde::Serialize;
 
-use super::{print, print_json};
+use super::{load_model, print, print_json};
 use crate::error::{Error, Result};
 use crate::exchange::onnx::{OPSET, OnnxOptions, onnx};
 use crate::exchange::source::{Language, source};
 use crate::files::atomic_file;
-use crate::model_file::Model;
 
 /// Write a model as an ONNX file, or as C or Rust source code that needs nothing else
 #[derive(Debug, Args)]
@@ -62,7 +61,7 @@ pub fn run(args: ExportArgs) -> Result<()> {
             args.file.display()
         )));
     }
-    let model = Model::load(&args.model)?;
+    let model = load_model(&args.model)?;
     if same_file(&args.model, &args.file) {
         return Err(Error::Usage(format!(
             "{} is the model itself; give another name for the export",

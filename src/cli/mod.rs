@@ -48,9 +48,11 @@ use clap::{Args, Parser, Subcommand};
 use serde::Serialize;
 
 use crate::error::{Error, Result};
-use crate::model_file::Model;
+use crate::model_file::{Model, notice_without_digest};
 use crate::observer::StopSignal;
+use crate::pilot::Pilot;
 use crate::recipe::Recipe;
+use crate::text::escaped;
 use crate::text::{escaped_json, escaped_lines};
 
 /// Learn to steer a car from its front camera, and drive with what was learned.
@@ -195,9 +197,30 @@ impl RecipeArgs {
     fn find_or_of(&self, from: &Path) -> Result<Recipe> {
         match self.recipe {
             Some(_) => self.find(),
-            None => Recipe::parse(&from.display().to_string(), &Model::load(from)?.recipe.to_toml()?, &self.overrides),
+            None => Recipe::parse(&from.display().to_string(), &load_model(from)?.recipe.to_toml()?, &self.overrides),
         }
     }
+}
+
+/// Reads a model, and says so if it has no digest.
+fn load_model(path: &Path) -> Result<Model> {
+    let model = Model::load(path)?;
+    say_if_without_digest(path)?;
+    Ok(model)
+}
+
+/// Reads a model to drive with, and says so if it has no digest.
+fn load_pilot(path: &Path) -> Result<Pilot> {
+    let pilot = Pilot::load(path)?;
+    say_if_without_digest(path)?;
+    Ok(pilot)
+}
+
+fn say_if_without_digest(path: &Path) -> Result<()> {
+    if let Some(notice) = notice_without_digest(path)? {
+        eprintln!("note: {}", escaped(&notice));
+    }
+    Ok(())
 }
 
 /// A rayon pool of `threads` (0: one for each core).

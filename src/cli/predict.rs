@@ -5,9 +5,8 @@ use std::path::PathBuf;
 use clap::Args;
 use serde::Serialize;
 
-use super::{print, print_json};
+use super::{load_pilot, print, print_json};
 use crate::error::Result;
-use crate::pilot::Pilot;
 
 /// Print the steering a model gives for images
 #[derive(Debug, Args)]
@@ -29,7 +28,7 @@ struct Answer {
 }
 
 pub fn run(args: PredictArgs) -> Result<()> {
-    let mut pilot = Pilot::load(&args.model)?;
+    let mut pilot = load_pilot(&args.model)?;
     let full_lock_deg = pilot.recipe().full_lock_deg;
     let mut answers = Vec::new();
     for image in args.images {

@@ -8,10 +8,9 @@ use std::time::{Duration, Instant};
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::{or_dash, print_json, stop_on_ctrl_c};
+use super::{load_pilot, or_dash, print_json, stop_on_ctrl_c};
 use crate::error::{Error, Result};
 use crate::observer::Observer;
-use crate::pilot::Pilot;
 use crate::serve::{HelmOptions, ServeEvent, Server, ServerOptions, Summary};
 use crate::text::escaped;
 use crate::udacity;
@@ -57,7 +56,7 @@ pub fn run(args: ServeArgs) -> Result<()> {
     if !(0.0..=1000.0).contains(&args.smooth) {
         return Err(Error::Usage(format!("--smooth {}: 0 to 1000 ms are meant", args.smooth)));
     }
-    let pilot = Pilot::load(&args.model)?;
+    let pilot = load_pilot(&args.model)?;
     let server = Server::bind(ServerOptions {
         address: SocketAddr::new(args.host, args.port),
         helm: HelmOptions {

@@ -1,6 +1,6 @@
 //! `steersman sim`: the built-in simulator as the client of a driving server.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 use serde::Serialize;
@@ -9,6 +9,7 @@ use super::share_bar::ShareBar;
 use super::{or_dash, print_json, stop_on_ctrl_c};
 use crate::error::{Error, Result};
 use crate::files::atomic_file;
+use crate::files::limits::keep_elsewhere;
 use crate::files::new_folder::create_now;
 use crate::observer::Observer;
 use crate::simulator::Track;
@@ -207,8 +208,13 @@ pub fn run(args: SimArgs) -> Result<()> {
     let report = drive(&track, &options, &mut observer)?;
     drop(bar);
     if let Some(out) = &args.out {
-        create_now(out)?;
-        atomic_file::write(&out.join(format!("free_{}.csv", args.seed)), trajectory_csv(&report.run).as_bytes())?;
+        let save = |folder: &Path| {
+            let name = format!("free_{}.csv", args.seed);
+            atomic_file::write(&folder.join(name), trajectory_csv(&report.run).as_bytes())
+        };
+        create_now(out).and_then(|()| save(out)).map_err(|cause| {
+            keep_elsewhere(cause, save, |folder| format!("the trajectory is kept in {}", folder.display()))
+        })?;
     }
     let summary = Summary::new(&args, &track, &report);
     if args.json {

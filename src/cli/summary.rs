@@ -7,7 +7,7 @@ use serde::Serialize;
 use steersman_kernels::Isa;
 
 use super::words::counted;
-use super::{RecipeArgs, or_dash, print, print_json, refuse_existing};
+use super::{RecipeArgs, load_model, or_dash, print, print_json, refuse_existing};
 use crate::engine::network::{NamedLayer, Network};
 use crate::error::Result;
 use crate::files::atomic_file;
@@ -76,7 +76,7 @@ pub fn run(args: SummaryArgs) -> Result<()> {
     let mut heading = String::new();
     let recipe = match &args.model {
         Some(path) => {
-            let model = Model::load(path)?;
+            let model = load_model(path)?;
             heading = format!("model {}\n{}", path.display(), about(&model));
             model.recipe
         }

@@ -108,11 +108,11 @@ pub fn run(args: TrainArgs) -> Result<()> {
             Some(folder) => pool.install(|| job.go_on(&folder)),
             None => {
                 let recipe = recipe()?;
-                let out = args.out.unwrap_or_else(|| RunFolder::next_free(&recipe.name));
                 eprintln!("{}", plan(&recipe, &scope, args.dagger, pool.current_num_threads())?);
+                let (out, claimed) = out_or_next(args.out, &recipe.name)?;
                 let (seed, cache_mib, algorithm) = (args.seed, args.cache, args.algorithm);
                 let request = JobRequest { recipe, out, seed, cache_mib, from, algorithm };
-                pool.install(|| job.begin(request))
+                claimed.settle(pool.install(|| job.begin(request)))
             }
         };
         let folder = job.folder().map(Path::to_path_buf);
@@ -149,7 +149,7 @@ pub fn run(args: TrainArgs) -> Result<()> {
             if !held_out.is_empty() {
                 eprintln!("note: {}", trained_on_held_out(&held_out));
             }
-            let out = args.out.unwrap_or_else(|| RunFolder::next_free(&recipe.name));
+            let (out, claimed) = out_or_next(args.out, &recipe.name)?;
             let request = TrainRequest {
                 recordings,
                 said: args.reading.said(),
@@ -161,7 +161,7 @@ pub fn run(args: TrainArgs) -> Result<()> {
                 profile: args.profile,
                 algorithm: args.algorithm,
             };
-            let result = pool.install(|| training::train(request, &mut display, &stop));
+            let result = claimed.settle(pool.install(|| training::train(request, &mut display, &stop)));
             (out, result)
         }
     };
@@ -198,6 +198,31 @@ fn plan(recipe: &Recipe, scope: &Scope, dagger_rounds: u32, threads: usize) -> R
         counted(scope.tracks.len(), "track"),
         counted(threads, "thread"),
     ))
+}
+
+/// A folder that was created for a run, if it was.
+struct Claimed(Option<PathBuf>);
+
+impl Claimed {
+    /// Removes the folder if the run ended before it had put anything there.
+    fn settle<T>(self, result: Result<T>) -> Result<T> {
+        if let (Err(_), Some(path)) = (&result, &self.0) {
+            // A folder with something in it stays.
+            let _ = std::fs::remove_dir(path);
+        }
+        result
+    }
+}
+
+/// The folder that the user named, or a new one under `runs/` for a recipe `name`.
+fn out_or_next(out: Option<PathBuf>, name: &str) -> Result<(PathBuf, Claimed)> {
+    match out {
+        Some(out) => Ok((out, Claimed(None))),
+        None => {
+            let out = RunFolder::create_next(name)?;
+            Ok((out.clone(), Claimed(Some(out))))
+        }
+    }
 }
 
 /// Writes the page of the finished run in `folder`. The run is saved; a page that cannot be written takes nothing from it.

@@ -7,9 +7,8 @@ use serde::Serialize;
 
 use super::recording_args::RecordingArgs;
 use super::share_bar::ShareBar;
-use super::{print_json, stop_on_ctrl_c};
+use super::{load_pilot, print_json, stop_on_ctrl_c};
 use crate::error::{Error, Result};
-use crate::pilot::Pilot;
 use crate::report::video::onlooker::Onlooker;
 use crate::report::video::recording;
 use crate::report::video::replay::{self, RunChoice};
@@ -55,7 +54,7 @@ struct Answer<'a> {
 
 pub fn run(args: VideoArgs) -> Result<()> {
     let onlooker = match &args.model {
-        Some(model) => Some(Onlooker::new(Pilot::load(model)?, args.saliency)?),
+        Some(model) => Some(Onlooker::new(load_pilot(model)?, args.saliency)?),
         None => None,
     };
     let is_drive = is_drive(&args.source);

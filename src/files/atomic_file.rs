@@ -1,4 +1,4 @@
-//! Files that are there whole or not at all.
+//! Files that appear whole or not at all.
 
 use std::fs::{self, File};
 use std::io::{self, Write};
@@ -8,9 +8,10 @@ use tempfile::NamedTempFile;
 
 use crate::error::{Error, Result};
 use crate::files::new_folder::{create_parent, denied, exists, explain_full_disk};
+use crate::files::unfinished;
 
-/// Writes `bytes` to a temporary file beside `path`, then renames it: whoever reads `path`, also after a crash or on a full
-/// disk, finds the old content or the new, never a part.
+/// Writes `bytes` to a temporary file beside `path`, then renames it. A reader of `path` finds the old content or the new one,
+/// never a part of it, even after a crash or on a full disk.
 ///
 /// # Errors
 ///
@@ -20,15 +21,15 @@ pub fn write(path: &Path, bytes: &[u8]) -> Result<()> {
         Some(parent) if !parent.as_os_str().is_empty() => parent,
         _ => Path::new("."),
     };
-    let mut file = temporary(folder).map_err(Error::io(folder))?;
+    let mut file = unfinished::new_file(folder, path).map_err(Error::io(folder))?;
     file.write_all(bytes).map_err(Error::io(path))?;
     file.as_file().sync_all().map_err(Error::io(path))?;
     file.persist(path).map_err(|e| Error::io(path)(e.error))?;
     Ok(())
 }
 
-/// A file that is written little by little under a hidden name beside its place and gets its own name when it is whole.
-/// Dropped before, it leaves nothing behind.
+/// A file that grows under a hidden name beside its place, and gets its own name when it is complete. Dropped before, it
+/// leaves nothing behind.
 #[derive(Debug)]
 pub struct NewFile {
     path: PathBuf,
@@ -45,11 +46,11 @@ impl NewFile {
         if fs::symlink_metadata(path).is_ok() {
             return Err(exists(path, "file"));
         }
-        let unfinished = temporary(create_parent(path)?).map_err(|source| denied(path, &source))?;
+        let unfinished = unfinished::new_file(create_parent(path)?, path).map_err(|source| denied(path, &source))?;
         Ok(NewFile { path: path.to_path_buf(), unfinished })
     }
 
-    /// What to write to.
+    /// Opens the file for writing.
     ///
     /// # Errors
     ///
@@ -78,14 +79,6 @@ impl NewFile {
     pub fn explain(&self, source: io::Error) -> Error {
         explain_full_disk(&self.path, &self.path, source, "file")
     }
-}
-
-fn temporary(folder: &Path) -> io::Result<NamedTempFile> {
-    let mut builder = tempfile::Builder::new();
-    // Temporary files are for their owner alone; a model or a video is as readable as any other file.
-    #[cfg(unix)]
-    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
-    builder.tempfile_in(folder)
 }
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! Folders that are there whole or not at all.
+//! Folders that appear whole or not at all.
 
 use std::fs;
 use std::io::{self, ErrorKind};
@@ -6,14 +6,18 @@ use std::path::{Path, PathBuf};
 
 use tempfile::TempDir;
 
+use super::lock::Lock;
+use super::unfinished;
 use crate::error::{Error, Result};
 
-/// A folder that is filled under a hidden name beside its place and gets its own name when it is whole. Dropped before, it
+/// A folder that fills under a hidden name beside its place, and gets its own name when it is complete. Dropped before, it
 /// leaves nothing behind.
 #[derive(Debug)]
 pub struct NewFolder {
     path: PathBuf,
     unfinished: TempDir,
+    /// Tells other processes that this one still writes.
+    lock: Lock,
 }
 
 impl NewFolder {
@@ -27,15 +31,8 @@ impl NewFolder {
             return Err(exists(path, "folder"));
         }
         let parent = create_parent(path)?;
-        let name = path.file_name().unwrap_or_default().to_string_lossy();
-        let prefix = format!(".{name}-unfinished-");
-        let mut builder = tempfile::Builder::new();
-        builder.prefix(&prefix);
-        // Temporary folders are for their owner alone; this one is as readable as any other folder.
-        #[cfg(unix)]
-        builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o777));
-        let unfinished = builder.tempdir_in(parent).map_err(|source| denied(path, &source))?;
-        Ok(NewFolder { path: path.to_path_buf(), unfinished })
+        let (unfinished, lock) = unfinished::new_folder(parent, path).map_err(|source| denied(path, &source))?;
+        Ok(NewFolder { path: path.to_path_buf(), unfinished, lock })
     }
 
     /// Where to write.
@@ -50,34 +47,38 @@ impl NewFolder {
     /// [`Error::Usage`] if something has come to be at its place, [`Error::Io`] if it cannot be renamed. What was written is
     /// removed then.
     pub fn finish(self) -> Result<()> {
-        if fs::symlink_metadata(&self.path).is_ok() {
-            return Err(exists(&self.path, "folder"));
+        let NewFolder { path, unfinished, lock } = self;
+        if fs::symlink_metadata(&path).is_ok() {
+            return Err(exists(&path, "folder"));
         }
-        fs::rename(self.unfinished.path(), &self.path).map_err(Error::io(&self.path))?;
-        // It has moved away; there is nothing left to remove.
-        let _moved = self.unfinished.keep();
+        drop(lock);
+        fs::rename(unfinished.path(), &path).map_err(Error::io(&path))?;
+        // The folder has moved; there is nothing left to remove.
+        let _moved = unfinished.keep();
         Ok(())
     }
 
     /// Gives the folder its name, for what cannot be done again: if something has come to be at its place, a number is added,
     /// as in `DIR-2`, and if it cannot be renamed it stays under its hidden name. The name that it got.
     pub fn finish_anyhow(self) -> PathBuf {
+        let NewFolder { path, unfinished, lock } = self;
+        drop(lock);
         let numbered = |n: usize| {
-            let mut name = self.path.clone().into_os_string();
+            let mut name = path.clone().into_os_string();
             name.push(format!("-{n}"));
             PathBuf::from(name)
         };
-        let names = std::iter::once(self.path.clone()).chain((2..100).map(numbered));
+        let names = std::iter::once(path.clone()).chain((2..100).map(numbered));
         let free = names.into_iter().find(|name| fs::symlink_metadata(name).is_err());
-        let renamed = free.filter(|name| fs::rename(self.unfinished.path(), name).is_ok());
-        let hidden = self.unfinished.keep();
+        let renamed = free.filter(|name| fs::rename(unfinished.path(), name).is_ok());
+        let hidden = unfinished.keep();
         renamed.unwrap_or(hidden)
     }
 
     /// An error of writing to the folder, as its user should read it: with the place that was meant, and a remedy where the
     /// disk is full.
     pub fn explain(&self, error: Error) -> Error {
-        let Error::Io { path, source } = error else { return error };
+        let (Error::Io { path, source } | Error::CannotWrite { path, source, .. }) = error else { return error };
         let path = path.strip_prefix(self.unfinished()).map_or(path.clone(), |inside| self.path.join(inside));
         explain_full_disk(&path, &self.path, source, "folder")
     }
@@ -87,8 +88,7 @@ impl NewFolder {
 pub(crate) fn explain_full_disk(path: &Path, out: &Path, source: io::Error, kind: &str) -> Error {
     let full = [ErrorKind::StorageFull, ErrorKind::QuotaExceeded, ErrorKind::FileTooLarge];
     if full.contains(&source.kind()) {
-        let remedy =
-            format!("nothing of {} is kept; make room on that disk, or name a {kind} on another", out.display());
+        let remedy = format!("{} was not created; make room on that disk, or name a {kind} on another", out.display());
         return Error::CannotWrite { path: path.into(), source, remedy };
     }
     Error::io(path)(source)

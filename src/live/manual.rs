@@ -119,10 +119,10 @@ impl<'a> ManualDrive<'a> {
         };
         // The message names the intended place: the hidden one is gone when the user reads it.
         let hidden = folder.unfinished().to_path_buf();
+        let place = |path: PathBuf| path.strip_prefix(&hidden).map_or(path.clone(), |inside| out.join(inside));
         let trouble = trouble.map(|error| match error {
-            Error::Io { path, source } => {
-                Error::Io { path: path.strip_prefix(&hidden).map_or(path.clone(), |inside| out.join(inside)), source }
-            }
+            Error::Io { path, source } => Error::Io { path: place(path), source },
+            Error::CannotWrite { path, source, remedy } => Error::CannotWrite { path: place(path), source, remedy },
             other => other,
         });
         let folder = (rows > 0).then(|| folder.finish_anyhow());

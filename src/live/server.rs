@@ -1,10 +1,9 @@
 //! Serves the page and its WebSocket, to this machine only.
 
 use std::io::{Read as _, Write as _};
-use std::net::{Ipv4Addr, SocketAddr, TcpListener, TcpStream};
+use std::net::{Ipv4Addr, Shutdown, SocketAddr, TcpListener};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
@@ -15,6 +14,7 @@ use super::controls::Wheel;
 use super::hub::Hub;
 use super::messages::{Farewell, Hello, Request, State};
 use crate::error::{Error, Result};
+use crate::net::connections::{Connections, Peer, Rank};
 use crate::net::handshake;
 use crate::net::http::{self, BadHead, Head};
 use crate::net::socket::{Socket, is_timeout};
@@ -32,6 +32,10 @@ const HEADERS: &str = "Content-Security-Policy: default-src 'none'; script-src '
     Cache-Control: no-store\r\n";
 /// Largest number of open connections.
 const MAX_CONNECTIONS: usize = 32;
+/// Longest time that a new connection waits until another has made room.
+const ROOM_PATIENCE: Duration = Duration::from_millis(100);
+/// Time without a request after which a page is idle, and makes room if there are too many connections.
+const IDLE_TIME: Duration = Duration::from_secs(5);
 /// Longest time for a whole request.
 const MAX_REQUEST_TIME: Duration = Duration::from_secs(5);
 /// Time that a browser has to read the last words.
@@ -94,7 +98,7 @@ impl Live {
     }
 
     /// Calls `look` with the wheel, if a person may drive.
-    pub fn with_wheel<T>(&self, look: impl FnOnce(&mut Wheel) -> T) -> Option<T> {
+    pub(crate) fn with_wheel<T>(&self, look: impl FnOnce(&mut Wheel) -> T) -> Option<T> {
         self.hub.wheel().map(|mut wheel| look(&mut wheel))
     }
 
@@ -120,7 +124,7 @@ impl Drop for Live {
 
 /// Accepts connections until the end, and waits until they have ended.
 fn listen(listener: &TcpListener, port: u16, hub: &Hub) {
-    let open = AtomicUsize::new(0);
+    let connections = Connections::new(MAX_CONNECTIONS);
     std::thread::scope(|scope| {
         let mut id = 0;
         while hub.over().is_none() {
@@ -129,28 +133,28 @@ fn listen(listener: &TcpListener, port: u16, hub: &Hub) {
                 std::thread::sleep(LISTEN_PAUSE);
                 continue;
             };
-            if open.load(Ordering::Relaxed) >= MAX_CONNECTIONS {
-                continue;
-            }
             id += 1;
-            open.fetch_add(1, Ordering::Relaxed);
-            let open = &open;
+            // A connection without room is dropped, and so closed.
+            let (Some(peer), _) = connections.add(id, &Arc::new(stream), ROOM_PATIENCE) else { continue };
+            let connections = &connections;
             let thread = std::thread::Builder::new().name(format!("viewer {id}")).stack_size(STACK);
             let serve = move || {
                 // The browser opens another connection if this one fails.
-                let _ = catch_unwind(AssertUnwindSafe(|| serve(stream, id, port, hub)));
-                open.fetch_sub(1, Ordering::Relaxed);
+                let _ = catch_unwind(AssertUnwindSafe(|| serve(&peer, port, hub)));
+                // It may be closed already.
+                let _ = peer.stream.shutdown(Shutdown::Both);
+                connections.remove(id);
             };
             if thread.spawn_scoped(scope, serve).is_err() {
-                open.fetch_sub(1, Ordering::Relaxed);
+                connections.remove(id);
             }
         }
     });
 }
 
 /// Answers one request. An error ends the connection; there is no one to tell.
-fn serve(stream: TcpStream, id: u64, port: u16, hub: &Hub) -> std::io::Result<()> {
-    let mut socket = Socket::new(stream, SLOW_TICK)?;
+fn serve(peer: &Peer, port: u16, hub: &Hub) -> std::io::Result<()> {
+    let mut socket = Socket::new(peer.stream.try_clone()?, SLOW_TICK)?;
     let began = Instant::now();
     let mut bytes = Vec::with_capacity(1024);
     while began.elapsed() < MAX_REQUEST_TIME && hub.over().is_none() {
@@ -178,7 +182,8 @@ fn serve(stream: TcpStream, id: u64, port: u16, hub: &Hub) -> std::io::Result<()
             }
             Answer::Open { response, len } => {
                 socket.write_all(response.as_bytes())?;
-                show(socket, bytes[len..].to_vec(), id, hub);
+                peer.set_rank(Rank::WebSocket);
+                show(socket, bytes[len..].to_vec(), peer, hub);
                 Ok(())
             }
         };
@@ -228,16 +233,16 @@ fn answer(head: &Head, port: u16) -> Answer {
 }
 
 /// Shows the drive to one page until the drive or the page ends.
-fn show(socket: Socket, rest: Vec<u8>, id: u64, hub: &Hub) {
+fn show(socket: Socket, rest: Vec<u8>, peer: &Peer, hub: &Hub) {
     let config = WebSocketConfig::default()
         .read_buffer_size(MAX_MESSAGE)
         .write_buffer_size(0)
         .max_message_size(Some(MAX_MESSAGE))
         .max_frame_size(Some(MAX_MESSAGE));
     let mut socket = WebSocket::from_partially_read(socket, rest, Role::Server, Some(config));
-    let viewer = hub.enter(id);
+    let viewer = hub.enter(peer.id);
     // An error means that the page is gone.
-    let shown = frames(&mut socket, id, hub);
+    let shown = frames(&mut socket, peer, hub);
     drop(viewer);
     if shown.is_ok()
         && let Some(words) = hub.over()
@@ -252,23 +257,28 @@ fn show(socket: Socket, rest: Vec<u8>, id: u64, hub: &Hub) {
 }
 
 /// Sends a frame whenever the page has asked for one and there is a new one.
-fn frames(socket: &mut WebSocket<Socket>, id: u64, hub: &Hub) -> tungstenite::Result<()> {
-    socket.send(Message::text(hub.opening(id)))?;
-    let (mut seen, mut wanted) = (0, false);
+fn frames(socket: &mut WebSocket<Socket>, peer: &Peer, hub: &Hub) -> tungstenite::Result<()> {
+    socket.send(Message::text(hub.opening(peer.id)))?;
+    let (mut seen, mut wanted, mut last_request) = (0, false, None);
     while hub.over().is_none() {
         socket.get_mut().set_tick(if wanted { QUICK_TICK } else { SLOW_TICK })?;
         socket.get_mut().begin_tick();
         match socket.read() {
-            Ok(Message::Text(text)) => match serde_json::from_str(&text) {
-                Ok(Request::Next) => wanted = true,
-                Ok(request) => hub.request(id, request),
-                Err(_) => return Err(tungstenite::Error::ConnectionClosed),
-            },
+            Ok(Message::Text(text)) => {
+                match serde_json::from_str(&text) {
+                    Ok(Request::Next) => wanted = true,
+                    Ok(request) => hub.request(peer.id, request),
+                    Err(_) => return Err(tungstenite::Error::ConnectionClosed),
+                }
+                last_request = Some(Instant::now());
+            }
             Ok(Message::Close(_)) => return Err(tungstenite::Error::ConnectionClosed),
             Ok(_) => {}
             Err(tungstenite::Error::Io(error)) if is_timeout(&error) => {}
             Err(error) => return Err(error),
         }
+        let in_use = wanted || last_request.is_some_and(|last: Instant| last.elapsed() < IDLE_TIME);
+        peer.set_rank(if in_use { Rank::InUse } else { Rank::WebSocket });
         if wanted && let Some((number, message)) = hub.newer_than(seen) {
             socket.send(Message::Binary(message))?;
             (seen, wanted) = (number, false);

@@ -11,7 +11,7 @@ use super::{MainJobResult, TRACKS, TrackResult, dagger, test_on_track};
 
 use crate::dataset::Description;
 use crate::error::{Error, Result};
-use crate::files::atomic_file;
+use crate::files::checksums;
 use crate::observer::{Observer, Parts, Progress, StopSignal};
 use crate::pilot::Pilot;
 use crate::recipe::Recipe;
@@ -44,19 +44,19 @@ impl JobNote {
         if !path.is_file() {
             return Ok(None);
         }
-        let text = std::fs::read_to_string(&path).map_err(Error::io(&path))?;
-        serde_json::from_str(&text).map(Some).map_err(|e| Error::data_at(&path, e.line() as u64, e.to_string()))
+        let bytes = checksums::read(folder, RunFolder::JOB_NOTE)?;
+        serde_json::from_slice(&bytes).map(Some).map_err(|e| Error::data_at(&path, e.line() as u64, e.to_string()))
     }
 
     fn write(&self, folder: &Path) -> Result<()> {
         std::fs::create_dir_all(folder).map_err(Error::io(folder))?;
-        write_json(&folder.join(RunFolder::JOB_NOTE), self)
+        write_json(folder, RunFolder::JOB_NOTE, self)
     }
 }
 
-fn write_json(path: &Path, value: &impl Serialize) -> Result<()> {
-    let text = serde_json::to_string_pretty(value).map_err(|e| Error::data(path, e.to_string()))?;
-    atomic_file::write(path, (text + "\n").as_bytes())
+fn write_json(folder: &Path, name: &str, value: &impl Serialize) -> Result<()> {
+    let text = serde_json::to_string_pretty(value).map_err(|e| Error::data(folder.join(name), e.to_string()))?;
+    checksums::write(folder, name, (text + "\n").as_bytes())
 }
 
 /// What happens in a main job.
@@ -201,9 +201,10 @@ impl<'a> Job<'a> {
         while self.note.round < self.note.dagger_rounds {
             training = self.dagger_round(&training)?;
         }
+        let _lock = self.folder.as_ref().map(|folder| RunFolder::open(folder)?.lock()).transpose()?;
         let result = MainJobResult { drives: self.drives(&training.model)?, training };
         if let Some(folder) = &self.folder {
-            write_json(&folder.join("drives.json"), &result.drives)?;
+            write_json(folder, "drives.json", &result.drives)?;
         }
         Ok(result)
     }

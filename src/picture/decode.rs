@@ -2,6 +2,7 @@
 
 use image::ImageDecoder as _;
 use image::metadata::Orientation;
+use std::borrow::Cow;
 use std::io::Cursor;
 use zune_jpeg::JpegDecoder;
 use zune_jpeg::zune_core::bytestream::ZCursor;
@@ -12,6 +13,15 @@ use super::RgbImage;
 
 /// Largest height or width that is decoded, in pixels.
 pub const MAX_SIDE: usize = 8192;
+
+/// Most pixels of an image that is decoded: 16 megapixels.
+pub const MAX_PIXELS: usize = 16 << 20;
+
+/// Longest file of a picture that is read, bytes.
+pub const MAX_FILE_LEN: u64 = 64 << 20;
+
+/// Most memory that decoding a PNG may take, bytes.
+const MAX_DECODED_LEN: u64 = 64 << 20;
 
 /// First bytes of every PNG file.
 const PNG_SIGNATURE: &[u8] = b"\x89PNG\r\n\x1a\n";
@@ -48,6 +58,14 @@ pub fn decode_rgb_within(bytes: &[u8], max_side: usize, image: &mut RgbImage) ->
 /// # Errors
 /// As [`decode_rgb`].
 pub fn image_size(bytes: &[u8]) -> Result<[usize; 2], String> {
+    if bytes.starts_with(PNG_SIGNATURE) {
+        // Other readers would unpack the profiles and texts that stand before the pixels.
+        let number = |at: usize| Some(u32::from_be_bytes(*bytes.get(at..)?.first_chunk()?) as usize);
+        return match (bytes.get(12..16), number(20), number(16)) {
+            (Some(b"IHDR"), Some(height), Some(width)) => Ok([height, width]),
+            _ => Err("the PNG has no header".into()),
+        };
+    }
     let reader = image::ImageReader::new(Cursor::new(bytes)).with_guessed_format().map_err(|e| e.to_string())?;
     let mut decoder = reader.into_decoder().map_err(|e| e.to_string())?;
     let (width, height) = decoder.dimensions();
@@ -94,6 +112,7 @@ fn decode_jpeg(bytes: &[u8], max_side: usize, image: &mut RgbImage) -> Result<()
     let mut decoder = JpegDecoder::new_with_options(ZCursor::new(data), lenient);
     decoder.decode_headers().map_err(failed)?;
     let (width, height) = decoder.dimensions().ok_or("the JPEG has no size")?;
+    check_pixels(height, width)?;
     image.pixels.resize(width * height * 3, 0);
     if decoder.output_buffer_size() != Some(image.pixels.len()) {
         return Err("the JPEG has colours that cannot be turned into RGB".into());
@@ -180,16 +199,47 @@ fn turn(image: &mut RgbImage, orientation: Orientation) {
 }
 
 fn decode_png(bytes: &[u8], max_side: usize, image: &mut RgbImage) -> Result<(), String> {
-    let mut reader = image::ImageReader::with_format(Cursor::new(bytes), image::ImageFormat::Png);
+    let [height, width] = image_size(bytes)?;
+    check_pixels(height, width)?;
+    let bytes = without_metadata(bytes);
+    let mut reader = image::ImageReader::with_format(Cursor::new(&*bytes), image::ImageFormat::Png);
     let mut limits = image::Limits::default();
     limits.max_image_width = Some(max_side as u32);
     limits.max_image_height = Some(max_side as u32);
+    limits.max_alloc = Some(MAX_DECODED_LEN);
     reader.limits(limits);
     let decoded = reader.decode().map_err(|error| format!("the PNG cannot be decoded: {error}"))?.into_rgb8();
     (image.height, image.width) = (decoded.height() as usize, decoded.width() as usize);
     image.pixels.clear();
     image.pixels.extend_from_slice(decoded.as_raw());
     Ok(())
+}
+
+fn check_pixels(height: usize, width: usize) -> Result<(), String> {
+    match height.checked_mul(width) {
+        Some(pixels) if pixels <= MAX_PIXELS => Ok(()),
+        _ => Err(format!("{width}x{height} pixels; at most 16 megapixels are decoded")),
+    }
+}
+
+/// A PNG without the chunks that say nothing about its pixels: profiles and texts, of which a few bytes can unpack to
+/// hundreds of megabytes.
+fn without_metadata(bytes: &[u8]) -> Cow<'_, [u8]> {
+    let mut kept = PNG_SIGNATURE.to_vec();
+    let mut rest = &bytes[PNG_SIGNATURE.len()..];
+    while let [a, b, c, d, kind @ ..] = rest
+        && let Some(kind) = kind.first_chunk::<4>()
+    {
+        let len = u32::from_be_bytes([*a, *b, *c, *d]) as usize;
+        // Length, kind and checksum stand around the content.
+        let (chunk, after) = rest.split_at(len.saturating_add(12).min(rest.len()));
+        if !matches!(kind, b"iCCP" | b"tEXt" | b"zTXt" | b"iTXt") {
+            kept.extend_from_slice(chunk);
+        }
+        rest = after;
+    }
+    kept.extend_from_slice(rest);
+    if kept.len() == bytes.len() { Cow::Borrowed(bytes) } else { Cow::Owned(kept) }
 }
 
 #[cfg(test)]
@@ -237,6 +287,43 @@ mod tests {
         encoder.write_image(&gradient(24, 40), 24, 40, image::ExtendedColorType::Rgb8).unwrap();
         assert!(decode_rgb_within(&png, 40, &mut image).is_ok());
         assert!(decode_rgb_within(&png, 39, &mut image).is_err());
+    }
+
+    #[test]
+    fn a_png_whose_profile_unpacks_to_hundreds_of_megabytes_costs_no_more_than_its_pixels() {
+        let mut png = Vec::new();
+        let encoder = image::codecs::png::PngEncoder::new(&mut png);
+        encoder.write_image(&gradient(24, 40), 24, 40, image::ExtendedColorType::Rgb8).unwrap();
+        let mut plain = RgbImage::default();
+        decode_rgb(&png, &mut plain).unwrap();
+
+        let mut packed = flate2::write::ZlibEncoder::new(b"bomb\0\0".to_vec(), flate2::Compression::best());
+        let zeros = vec![0; 1 << 20];
+        (0..512).for_each(|_| std::io::Write::write_all(&mut packed, &zeros).unwrap());
+        let packed = packed.finish().unwrap();
+        let mut crc = flate2::Crc::new();
+        crc.update(b"iCCP");
+        crc.update(&packed);
+        // Behind the signature and IHDR.
+        let chunk = [&(packed.len() as u32).to_be_bytes(), &b"iCCP"[..], &packed, &crc.sum().to_be_bytes()].concat();
+        let bomb = [&png[..33], &chunk, &png[33..]].concat();
+        assert!(bomb.len() < 1 << 20);
+        let kept = without_metadata(&bomb);
+        assert_eq!(&*kept, &png[..], "nothing unpacks the profile");
+        let mut image = RgbImage::default();
+        decode_rgb(&bomb, &mut image).unwrap();
+        assert!(image == plain && image_size(&bomb) == Ok([40, 24]));
+    }
+
+    #[test]
+    fn more_than_16_megapixels_are_refused_before_they_take_memory() {
+        let mut header = PNG_SIGNATURE.to_vec();
+        header.extend(13u32.to_be_bytes());
+        header.extend(b"IHDR");
+        header.extend([8192u32.to_be_bytes(), 2049u32.to_be_bytes()].concat());
+        header.extend([8, 2, 0, 0, 0, 0, 0, 0, 0]);
+        let error = decode_rgb(&header, &mut RgbImage::default()).unwrap_err();
+        assert!(error.contains("8192x2049 pixels; at most 16 megapixels"), "{error}");
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! Makes a command from the model's steering: smoothing, and a speed to hold.
 
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use crate::simulator::car::speed::{SpeedController, slower_in_bends_mph};
 use crate::udacity::Command;
@@ -22,6 +22,15 @@ impl Default for HelmOptions {
     }
 }
 
+/// Time after the last usable frame for which the helm holds the steering, without throttle. Then the car brakes.
+pub const HOLD_TIME: Duration = Duration::from_millis(500);
+/// Longest time of braking while the speed is unknown. A car that stands would drive backwards after that.
+const MAX_BLIND_BRAKE_S: f64 = 3.0;
+/// Speed below which the helm does not brake, mph: the simulator drives backwards when it brakes below 5 mph.
+const MIN_BRAKE_MPH: f64 = 5.0;
+/// Throttle of the brake.
+const BRAKE: f32 = -1.0;
+
 /// The time of a frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum FrameTime {
@@ -38,6 +47,8 @@ pub struct Helm {
     controller: SpeedController,
     began: Instant,
     last_s: Option<f64>,
+    /// Time of the last usable frame, and when it was answered.
+    last_frame: Option<(FrameTime, Instant)>,
     last: Command,
 }
 
@@ -49,6 +60,7 @@ impl Helm {
             controller: SpeedController::default(),
             began: Instant::now(),
             last_s: None,
+            last_frame: None,
             last: Command::default(),
         }
     }
@@ -58,10 +70,7 @@ impl Helm {
     /// Steering that is not finite becomes 0. `drive` computes its commands in the same way; without smoothing and slowing
     /// down, a client on simulated time gets the same bits.
     pub fn command(&mut self, steering: f32, speed_mph: f64, time: FrameTime) -> Command {
-        let time_s = match time {
-            FrameTime::Arrival(arrived) => arrived.saturating_duration_since(self.began).as_secs_f64(),
-            FrameTime::Simulated(time_s) => time_s,
-        };
+        let time_s = self.seconds(time);
         let mut steering = if steering.is_finite() { steering.clamp(-1.0, 1.0) } else { 0.0 };
         if let Some(last_s) = self.last_s.filter(|_| self.options.smooth_s > 0.0) {
             let share = 1.0 - (-(time_s - last_s).max(0.0) / self.options.smooth_s).exp();
@@ -73,14 +82,40 @@ impl Helm {
         }
         let throttle = self.controller.throttle_at(time_s, target_mph, speed_mph);
         self.last_s = Some(time_s);
+        self.last_frame = Some((time, Instant::now()));
         self.last = Command { steering, throttle };
         self.last
     }
 
-    /// The command without a usable frame: the last steering, and no throttle.
+    /// The command at `time` without a usable frame: the last steering without throttle for [`HOLD_TIME`], then the brake.
+    /// `speed_mph` is the speed, if it is known.
+    pub fn without_frame(&mut self, time: FrameTime, speed_mph: Option<f64>) -> Command {
+        let blind_s = match (time, self.last_frame) {
+            (_, None) => 0.0,
+            (FrameTime::Simulated(time_s), Some((FrameTime::Simulated(last_s), _))) => time_s - last_s,
+            (_, Some((_, answered))) => answered.elapsed().as_secs_f64(),
+        };
+        let hold_s = HOLD_TIME.as_secs_f64();
+        let moves = match speed_mph {
+            Some(mph) => mph >= MIN_BRAKE_MPH,
+            None => blind_s < hold_s + MAX_BLIND_BRAKE_S,
+        };
+        self.last.throttle = if blind_s >= hold_s && moves { BRAKE } else { 0.0 };
+        self.last
+    }
+
+    /// The command at the end of a drive: the last steering without throttle.
     pub fn cut_throttle(&mut self) -> Command {
         self.last.throttle = 0.0;
         self.last
+    }
+
+    /// Seconds of `time` since the drive began.
+    fn seconds(&self, time: FrameTime) -> f64 {
+        match time {
+            FrameTime::Arrival(arrived) => arrived.saturating_duration_since(self.began).as_secs_f64(),
+            FrameTime::Simulated(time_s) => time_s,
+        }
     }
 
     /// Begins anew after a person drove by hand: the integral of the speed controller has lost its meaning.
@@ -131,6 +166,27 @@ mod tests {
             }
             assert!((steering - (1.0 - (-1.0_f32).exp())).abs() < 1e-5, "{dt_s}: {steering}");
         }
+    }
+
+    #[test]
+    fn without_frames_the_steering_is_held_and_then_the_car_brakes() {
+        let mut helm = Helm::new(HelmOptions::default());
+        let good = helm.command(0.3, 14.0, FrameTime::Simulated(10.0));
+        assert!(good.throttle > 0.0);
+        for (time_s, mph, throttle) in [
+            (10.05, Some(14.0), 0.0),
+            (10.45, None, 0.0),
+            (10.5, Some(14.0), -1.0),
+            (11.0, None, -1.0),
+            (12.0, Some(4.0), 0.0),
+            (13.4, None, -1.0),
+            (13.6, None, 0.0),
+            (20.0, Some(9.0), -1.0),
+        ] {
+            let command = helm.without_frame(FrameTime::Simulated(time_s), mph);
+            assert_eq!(command, Command { steering: good.steering, throttle }, "{time_s} s, {mph:?} mph");
+        }
+        assert!(helm.command(0.1, 10.0, FrameTime::Simulated(21.0)).throttle > 0.0, "a good frame drives again");
     }
 
     #[test]

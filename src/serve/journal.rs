@@ -97,16 +97,21 @@ impl Incident {
                  version 2 of 2/07/17 speak another protocol"
             }
             Incident::Stale => {
-                "the throttle is cut and telemetry asked for; is the simulator's window minimised, in a menu, or its machine \
+                "the wheel is held, the throttle is cut and telemetry asked for; is the simulator's window minimised, in a menu, or its machine \
                  overloaded?"
             }
             Incident::Silent => {
                 "it is asked for; is the simulator's window minimised, in a menu, or its machine overloaded?"
             }
-            Incident::NoImage => "the throttle is cut; use a simulator with a front camera",
-            Incident::NoSpeed => "the throttle is cut; the field `speed` in mph is needed to hold a speed",
+            Incident::NoImage => {
+                "the throttle is cut, and after 0.5 s the car brakes; use a simulator with a front camera"
+            }
+            Incident::NoSpeed => {
+                "the throttle is cut, and after 0.5 s the car brakes; the field `speed` in mph is needed to hold a speed"
+            }
             Incident::UnreadableImage => {
-                "the throttle is cut; a JPEG or PNG of at most 1920x1920 pixels in base64 is expected"
+                "the wheel is held, the throttle is cut, and after 0.5 s the car brakes; a JPEG or PNG of at most 1920x1920 pixels in \
+                 base64 is expected"
             }
             Incident::SeatTaken => "it waits until that one leaves or is silent for more than 1 s",
             Incident::DecimalMark => "commands are written in the same way, no change of the language is needed",

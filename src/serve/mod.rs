@@ -1,8 +1,8 @@
 //! The server that drives Udacity's simulator: the simulator connects to it, sends telemetry, and gets commands.
 //!
-//! [`Server`] listens; each connection has a thread of its own, and one of them holds the [`seat`] and drives: a picture
-//! comes in, the [`Pilot`] steers, the [`helm`] makes the command. [`tokens`] keeps one telemetry in flight, [`recording`]
-//! writes what was driven, [`journal`] tells the user what is wrong and what to do. The messages are those of
+//! [`Server`] listens; each connection has a thread of its own, and one of them holds the seat and drives: a picture
+//! comes in, the [`Pilot`] steers, the helm makes the command. `tokens` keeps one telemetry in flight, `recording`
+//! writes what was driven, `journal` tells the user what is wrong and what to do. The messages are those of
 //! [`udacity`](crate::udacity).
 //!
 //! The server trusts no client: it bounds the number of connections, and the size and the time of each message, and it

@@ -52,7 +52,7 @@ pub struct Recorded {
 pub struct Recorder {
     folder: PathBuf,
     sender: SyncSender<Row>,
-    writer: JoinHandle<Result<u64>>,
+    writer: JoinHandle<(u64, Option<Error>)>,
     state: Mutex<State>,
 }
 
@@ -91,7 +91,7 @@ impl Recorder {
         let file = BufWriter::new(File::create_new(&log).map_err(Error::io(&log))?);
         let (sender, receiver) = sync_channel(MAX_QUEUED);
         let thread = std::thread::Builder::new().name("recording".into());
-        let writer = thread.spawn(move || write(&images, &log, file, &receiver)).map_err(Error::io(folder))?;
+        let writer = thread.spawn(move || write_all(&images, &log, file, &receiver)).map_err(Error::io(folder))?;
         let state = State { dropped: 0, last_ms: 0, simulated_from_ms: now_ms(), simulated_s: None };
         Ok(Recorder { folder: folder.into(), sender, writer, state: Mutex::new(state) })
     }
@@ -134,11 +134,15 @@ impl Recorder {
     ///
     /// # Errors
     ///
-    /// If a row cannot be written. The rows before it stay.
+    /// [`Error::EndedEarly`] if a row could not be written. The rows before it stay, and the error names their folder.
     pub fn finish(self) -> Result<Recorded> {
         let Recorder { folder, sender, writer, state } = self;
         drop(sender);
-        let rows = writer.join().map_err(|_| Error::Fault("the recording ended early".into()))??;
+        let (rows, trouble) = writer.join().map_err(|_| Error::Fault("the recording ended early".into()))?;
+        if let Some(cause) = trouble {
+            let kept = format!("the {rows} rows before are in {}", folder.display());
+            return Err(Error::EndedEarly { cause: Box::new(cause), kept });
+        }
         let dropped = state.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner).dropped;
         if rows == 0 {
             remove_empty(&folder)?;
@@ -164,23 +168,49 @@ fn now_ms() -> u64 {
     SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or(Duration::ZERO).as_millis() as u64
 }
 
-/// Writes rows until the sender is dropped, and returns their number. It writes the picture of a row before its line.
-fn write(images: &Path, log: &Path, mut file: BufWriter<File>, rows: &Receiver<Row>) -> Result<u64> {
+/// Writes rows until the sender is dropped or a row cannot be written. Returns their number and the error; the log then ends
+/// with the last whole row.
+fn write_all(images: &Path, log: &Path, mut file: BufWriter<File>, rows: &Receiver<Row>) -> (u64, Option<Error>) {
     let mut written = 0;
-    file.write_all(HEADER.as_bytes()).map_err(Error::io(log))?;
-    while let Ok(row) = rows.recv() {
-        let name = picture_name("center", row.time_ms);
-        let path = images.join(&name);
-        fs::write(&path, &row.image).map_err(Error::io(&path))?;
-        let Command { steering, throttle } = row.command;
-        let (accelerator, brake, speed) = (throttle.max(0.0), (-throttle).max(0.0), row.speed_mph as f32);
-        let picture = format!("IMG/{name}");
-        write_row(&mut file, ", ", [&picture, &"", &""], [steering, accelerator, brake, speed])
-            .and_then(|()| file.flush())
-            .map_err(Error::io(log))?;
-        written += 1;
+    let mut good_len = 0;
+    let mut write = |row: Option<Row>, good_len: &mut u64| -> Result<()> {
+        match row {
+            None => file.write_all(HEADER.as_bytes()).and_then(|()| file.flush()).map_err(Error::io(log))?,
+            Some(row) => write_row_and_picture(images, log, &mut file, &row)?,
+        }
+        *good_len = file.get_ref().metadata().map_err(Error::io(log))?.len();
+        Ok(())
+    };
+    let mut result = write(None, &mut good_len);
+    while result.is_ok()
+        && let Ok(row) = rows.recv()
+    {
+        result = write(Some(row), &mut good_len);
+        written += u64::from(result.is_ok());
     }
-    Ok(written)
+    if result.is_err() {
+        // What the buffer still holds is part of a row.
+        let (file, _) = file.into_parts();
+        let _ = file.set_len(good_len);
+    }
+    (written, result.err())
+}
+
+/// Writes a picture and then its line.
+fn write_row_and_picture(images: &Path, log: &Path, file: &mut BufWriter<File>, row: &Row) -> Result<()> {
+    let name = picture_name("center", row.time_ms);
+    let path = images.join(&name);
+    fs::write(&path, &row.image).map_err(|source| {
+        // Part of a picture is of no use.
+        let _ = fs::remove_file(&path);
+        Error::io(&path)(source)
+    })?;
+    let Command { steering, throttle } = row.command;
+    let (accelerator, brake, speed) = (throttle.max(0.0), (-throttle).max(0.0), row.speed_mph as f32);
+    let picture = format!("IMG/{name}");
+    write_row(&mut *file, ", ", [&picture, &"", &""], [steering, accelerator, brake, speed])
+        .and_then(|()| file.flush())
+        .map_err(Error::io(log))
 }
 
 #[cfg(test)]

@@ -99,7 +99,7 @@ impl State {
     ///
     /// [`Error::Io`] and [`Error::Data`].
     pub fn load(path: &Path, network: &Network, mut optimizer: Optimizer) -> Result<State> {
-        let bytes = std::fs::read(path).map_err(Error::io(path))?;
+        let bytes = model_file::read_file(path)?;
         let (tensors, metadata) = model_file::read_tensors(path, &bytes)?;
         let metadata: Metadata =
             serde_json::from_str(&metadata).map_err(|e| Error::data(path, format!("is no checkpoint: {e}")))?;

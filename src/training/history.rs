@@ -5,7 +5,6 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use crate::error::{Error, Result};
-use crate::files::atomic_file;
 
 /// One line of `history.csv`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -33,21 +32,20 @@ pub struct EpochRecord {
     pub seconds: f64,
 }
 
-/// Writes `history` as CSV, in whole or not at all.
+/// `history` as the CSV of the file `path`.
 ///
 /// # Errors
 ///
-/// [`Error::Io`].
-pub(super) fn write_history(path: &Path, history: &[EpochRecord]) -> Result<()> {
+/// [`Error::Data`] for values that CSV cannot hold.
+pub(super) fn history_csv(path: &Path, history: &[EpochRecord]) -> Result<Vec<u8>> {
     let mut writer = csv::Writer::from_writer(Vec::new());
     for record in history {
         writer.serialize(record).map_err(|e| Error::data(path, e.to_string()))?;
     }
-    let bytes = writer.into_inner().map_err(|e| Error::data(path, e.to_string()))?;
-    atomic_file::write(path, &bytes)
+    writer.into_inner().map_err(|e| Error::data(path, e.to_string()))
 }
 
-/// Reads what [`write_history`] wrote.
+/// Reads what [`history_csv`] made.
 ///
 /// # Errors
 ///
@@ -83,7 +81,7 @@ mod tests {
             seconds: 2.0,
         };
         let history = [record, EpochRecord { epoch: 2, ..record }];
-        write_history(&path, &history).unwrap();
+        std::fs::write(&path, history_csv(&path, &history).unwrap()).unwrap();
         assert_eq!(read_history(&path).unwrap(), history);
         std::fs::write(&path, std::fs::read_to_string(&path).unwrap().replace("\n2,", "\nx,")).unwrap();
         assert!(read_history(&path).unwrap_err().to_string().contains("history.csv:3:"));

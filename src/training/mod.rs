@@ -10,6 +10,8 @@
 //! | `model.safetensors` | the best model, by validation loss |
 //! | `last.safetensors` | the model of the last epoch; with early stopping, in the end the best one |
 //! | `checkpoint.safetensors` | the state of the run, from which it resumes |
+//! | `checksums.txt` | SHA-256 of the text files above, as `sha256sum` writes it; they are checked when they are read |
+//! | `.lock` | there while a process works on the run; the system releases it with the process |
 //! | `report.html` | the run in pictures; see [`crate::report::pages::run`] |
 //! | `result.json` | what `train --json` prints; its presence says that the run is finished |
 

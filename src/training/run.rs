@@ -10,9 +10,9 @@ use steersman_kernels::{Backend, Isa};
 
 use super::checkpoint::{Progress, State};
 use super::data::{Data, images};
-use super::history::{EpochRecord, write_history};
+use super::history::EpochRecord;
 use super::profile::{Profile, ProfileReport};
-use super::run_folder::{RunFolder, RunInfo};
+use super::run_folder::{RunFolder, RunInfo, RunLock};
 use super::transfer::{Start, TransferRequest};
 use super::validation::{Validation, ValidationResult};
 use crate::dataset::Description;
@@ -23,6 +23,7 @@ use crate::engine::optimizer::Optimizer;
 use crate::engine::stopwatch::Stopwatch;
 use crate::error::{Error, Result};
 use crate::files::atomic_file;
+use crate::files::limits::keep_elsewhere;
 use crate::model_file::{Model, TrainingRecord, weights_hash};
 use crate::observer::{Observer, StopSignal};
 use crate::recipe::{Keep, Recipe};
@@ -149,7 +150,7 @@ pub fn train(
             trained_on_held_out.push(track.clone());
         }
     }
-    let folder = RunFolder::create(&out)?;
+    let (folder, lock) = RunFolder::create(&out)?;
     folder.write_recipe(&recipe)?;
     let absolute = |path: &PathBuf| std::path::absolute(path).map_err(Error::io(path));
     let info = RunInfo {
@@ -171,7 +172,7 @@ pub fn train(
     }
     data.write_split(&folder.file("split.csv"))?;
     folder.write_json("run.json", &info)?;
-    let run = TrainingRun::new(folder, info, recipe, data, start, started)?;
+    let run = TrainingRun::new((folder, lock), info, recipe, data, start, started)?;
     run.measured(profile).run(observer, stop)
 }
 
@@ -205,6 +206,12 @@ pub fn resume_with(
     let started = Instant::now();
     let profile = profile.then(Profile::start);
     let folder = RunFolder::open(path)?;
+    let lock = folder.lock()?;
+    if !folder.has_checksums() {
+        let notice =
+            "this run was begun by an earlier version and has no checksums: damage to its files may go unnoticed";
+        observer.observe(TrainingEvent::Notice(notice.into()))?;
+    }
     if let Some(result) = folder.result()? {
         observer.observe(TrainingEvent::Notice("this run is finished; here is its result again".into()))?;
         return Ok(TrainResult { model: folder.model(), ..result });
@@ -249,13 +256,15 @@ pub fn resume_with(
     }
     let from = info.transfer.as_ref().map(TransferRequest::of);
     let start = from.map(|from| Start::load(&folder.from(), &from, &recipe, info.seed)).transpose()?;
-    let mut run = TrainingRun::new(folder, info, recipe, data, start, started)?;
+    let mut run = TrainingRun::new((folder, lock), info, recipe, data, start, started)?;
     run.restore()?;
     run.measured(profile).run(observer, stop)
 }
 
 struct TrainingRun {
     folder: RunFolder,
+    /// Held until the end of the run.
+    _lock: RunLock,
     info: RunInfo,
     recipe: Recipe,
     network: Network,
@@ -272,7 +281,7 @@ struct TrainingRun {
 
 impl TrainingRun {
     fn new(
-        folder: RunFolder,
+        (folder, lock): (RunFolder, RunLock),
         info: RunInfo,
         recipe: Recipe,
         data: Data,
@@ -305,6 +314,7 @@ impl TrainingRun {
             validation: validation.map(|loader| Validation::new(loader, &network, capacity, recipe.full_lock_deg)),
             state: State { parameters, optimizer, best: None, progress: Progress::default() },
             folder,
+            _lock: lock,
             info,
             recipe,
             network,
@@ -371,7 +381,6 @@ impl TrainingRun {
                 self.report_images(observer)?;
             }
             self.state.progress.seconds = seconds_before + self.started.elapsed().as_secs_f64();
-            write_history(&self.folder.file("history.csv"), &self.state.progress.history)?;
             self.save_checkpoint()?;
             observed?;
         }
@@ -523,14 +532,43 @@ impl TrainingRun {
     }
 
     /// The same, where the weights are those after `epoch` (from 1).
+    ///
+    /// # Errors
+    ///
+    /// [`Error::EndedEarly`] if the run folder cannot be written, and all of the run is kept among the temporary files.
     fn save_with_last(&self, epoch: u32) -> Result<()> {
-        self.state.save(&self.folder.file("checkpoint.safetensors"), &self.network)?;
+        self.save_into(&self.folder, epoch).map_err(|cause| {
+            let copy = |path: &Path| self.copy_into(&RunFolder::at(path), epoch);
+            keep_elsewhere(cause, copy, |path| {
+                let path = path.display();
+                format!("the run so far is kept in {path}; go on with: steersman train --resume {path}")
+            })
+        })
+    }
+
+    /// Writes all that is needed to go on with the run into another folder.
+    fn copy_into(&self, folder: &RunFolder, epoch: u32) -> Result<()> {
+        folder.write_recipe(&self.recipe)?;
+        folder.write_json("run.json", &self.info)?;
+        for name in ["from.safetensors", "split.csv", RunFolder::JOB_NOTE] {
+            if self.folder.file(name).is_file() {
+                std::fs::copy(self.folder.file(name), folder.file(name)).map_err(Error::io(folder.file(name)))?;
+            }
+        }
+        self.save_into(folder, epoch)
+    }
+
+    fn save_into(&self, folder: &RunFolder, epoch: u32) -> Result<()> {
+        if !self.state.progress.history.is_empty() {
+            folder.write_history(&self.state.progress.history)?;
+        }
+        self.state.save(&folder.file("checkpoint.safetensors"), &self.network)?;
         if let Some(best) = &self.state.best {
             let progress = &self.state.progress;
-            self.model(best, progress.best_epoch).save(&self.folder.model())?;
+            self.model(best, progress.best_epoch).save(&folder.model())?;
             // In the middle of an epoch the weights have no measures of their own; only the checkpoint stores them.
             if progress.next_batch == 0 {
-                self.model(&self.state.parameters, epoch).save(&self.folder.file("last.safetensors"))?;
+                self.model(&self.state.parameters, epoch).save(&folder.file("last.safetensors"))?;
             }
         }
         Ok(())

@@ -6,11 +6,12 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use steersman_kernels::conv::ConvAlgorithm;
 
-use super::history::{EpochRecord, read_history};
+use super::history::{EpochRecord, history_csv, read_history};
 use super::run::TrainResult;
 use crate::dataset::Description;
 use crate::error::{Error, Result};
-use crate::files::atomic_file;
+use crate::files::lock::{LOCK_NAME, Lock};
+use crate::files::{checksums, unfinished};
 use crate::model_file::Transfer;
 use crate::recipe::Recipe;
 
@@ -18,6 +19,12 @@ use crate::recipe::Recipe;
 #[derive(Clone, Debug)]
 pub(crate) struct RunFolder {
     path: PathBuf,
+}
+
+/// The lock of a run folder. It ends with its process, however that ends.
+#[derive(Debug)]
+pub(crate) struct RunLock {
+    _lock: Lock,
 }
 
 /// The content of `run.json`.
@@ -76,7 +83,11 @@ impl RunFolder {
     ///
     /// [`Error::Usage`] if there is something in it already, [`Error::Io`] if it cannot be read.
     pub fn require_free(path: &Path) -> Result<()> {
-        let taken = |entry: std::io::Result<std::fs::DirEntry>| entry.is_ok_and(|e| e.file_name() != Self::JOB_NOTE);
+        let may_be_there = [Self::JOB_NOTE, LOCK_NAME, checksums::FILE_NAME];
+        let taken = |entry: std::io::Result<std::fs::DirEntry>| {
+            entry
+                .is_ok_and(|e| !may_be_there.iter().any(|name| e.file_name() == *name) && !unfinished::is_left_over(&e))
+        };
         if path.exists() && std::fs::read_dir(path).map_err(Error::io(path))?.any(taken) {
             return Err(Error::Usage(format!(
                 "{} is not empty and stays as it is; give another folder with --out, or go on with that run: --resume {}",
@@ -87,15 +98,38 @@ impl RunFolder {
         Ok(())
     }
 
-    /// A new run in `path`, which must not exist or be empty.
+    /// A new run in `path`, which must not exist or be empty, and the lock of its folder.
     ///
     /// # Errors
     ///
-    /// As [`RunFolder::require_free`]; [`Error::Io`] if it cannot be made.
-    pub fn create(path: &Path) -> Result<RunFolder> {
+    /// As [`RunFolder::require_free`] and [`RunFolder::lock`]; [`Error::Io`] if it cannot be made.
+    pub fn create(path: &Path) -> Result<(RunFolder, RunLock)> {
         RunFolder::require_free(path)?;
         std::fs::create_dir_all(path).map_err(Error::io(path))?;
-        Ok(RunFolder { path: path.to_path_buf() })
+        let folder = RunFolder { path: path.to_path_buf() };
+        let lock = folder.lock()?;
+        // Another run may have begun here in between.
+        RunFolder::require_free(path)?;
+        Ok((folder, lock))
+    }
+
+    /// A folder for a copy of a run.
+    pub(super) fn at(path: &Path) -> RunFolder {
+        RunFolder { path: path.to_path_buf() }
+    }
+
+    /// Locks the folder against other processes as long as the lock lives, and removes what killed ones left unfinished.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Usage`] if another process has the lock, [`Error::Io`] if the folder cannot be written.
+    pub fn lock(&self) -> Result<RunLock> {
+        let lock = Lock::try_take(&self.path).map_err(Error::io(&self.path))?.ok_or_else(|| {
+            let remedy = "another process works on this run; wait for its end, or stop it";
+            Error::Usage(format!("{}: {remedy}", self.path.display()))
+        })?;
+        unfinished::clean(&self.path);
+        Ok(RunLock { _lock: lock })
     }
 
     /// The run in `path`.
@@ -111,9 +145,27 @@ impl RunFolder {
         Ok(folder)
     }
 
-    /// The first of `runs/NAME-1`, `runs/NAME-2`, … that does not exist.
-    pub fn next_free(name: &str) -> PathBuf {
-        (1..).map(|n| Path::new("runs").join(format!("{name}-{n}"))).find(|path| !path.exists()).expect("numbers go on")
+    /// Creates the first of `runs/NAME-1`, `runs/NAME-2`, … that does not exist. Each caller gets a folder of its own, even at
+    /// the same moment.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::CannotWrite`] and [`Error::Io`] if it cannot be created.
+    pub fn create_next(name: &str) -> Result<PathBuf> {
+        RunFolder::create_next_in(Path::new("runs"), name)
+    }
+
+    fn create_next_in(parent: &Path, name: &str) -> Result<PathBuf> {
+        std::fs::create_dir_all(parent).map_err(Error::io(parent))?;
+        for n in 1u64.. {
+            let path = parent.join(format!("{name}-{n}"));
+            match std::fs::create_dir(&path) {
+                Ok(()) => return Ok(path),
+                Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => {}
+                Err(error) => return Err(Error::io(&path)(error)),
+            }
+        }
+        unreachable!("a number is free")
     }
 
     /// How the run was begun.
@@ -146,6 +198,7 @@ impl RunFolder {
     ///
     /// As [`Recipe::find`].
     pub fn recipe(&self) -> Result<Recipe> {
+        checksums::read(&self.path, "recipe.toml")?;
         Recipe::find(&self.file("recipe.toml").display().to_string(), &[])
     }
 
@@ -155,6 +208,7 @@ impl RunFolder {
     ///
     /// As [`read_history`].
     pub fn history(&self) -> Result<Vec<EpochRecord>> {
+        checksums::read(&self.path, "history.csv")?;
         read_history(&self.file("history.csv"))
     }
 
@@ -170,17 +224,26 @@ impl RunFolder {
     pub(super) fn write_json(&self, name: &str, value: &impl Serialize) -> Result<()> {
         let path = self.file(name);
         let text = serde_json::to_string_pretty(value).map_err(|e| Error::data(&path, e.to_string()))?;
-        atomic_file::write(&path, (text + "\n").as_bytes())
+        checksums::write(&self.path, name, (text + "\n").as_bytes())
     }
 
     fn read_json<T: DeserializeOwned>(&self, name: &str) -> Result<T> {
         let path = self.file(name);
-        let text = std::fs::read_to_string(&path).map_err(Error::io(&path))?;
-        serde_json::from_str(&text).map_err(|e| Error::data_at(&path, e.line() as u64, e.to_string()))
+        let bytes = checksums::read(&self.path, name)?;
+        serde_json::from_slice(&bytes).map_err(|e| Error::data_at(&path, e.line() as u64, e.to_string()))
     }
 
     pub(super) fn write_recipe(&self, recipe: &Recipe) -> Result<()> {
-        atomic_file::write(&self.file("recipe.toml"), recipe.to_toml()?.as_bytes())
+        checksums::write(&self.path, "recipe.toml", recipe.to_toml()?.as_bytes())
+    }
+
+    pub(super) fn write_history(&self, history: &[EpochRecord]) -> Result<()> {
+        checksums::write(&self.path, "history.csv", &history_csv(&self.file("history.csv"), history)?)
+    }
+
+    /// Whether the files of the run have digests; those of earlier versions have none.
+    pub fn has_checksums(&self) -> bool {
+        checksums::exist(&self.path)
     }
 }
 
@@ -196,6 +259,33 @@ mod tests {
         assert!(error.contains("is not empty and stays as it is"), "{error}");
         assert!(folder.path().join("mine.txt").exists());
         assert!(RunFolder::create(&folder.path().join("new")).is_ok());
+    }
+
+    #[test]
+    fn callers_at_the_same_moment_get_folders_of_their_own() {
+        let scratch = tempfile::tempdir().unwrap();
+        let runs = scratch.path().join("runs");
+        let mut paths = std::thread::scope(|scope| {
+            let create = || (0..25).map(|_| RunFolder::create_next_in(&runs, "a").unwrap()).collect::<Vec<_>>();
+            let threads: Vec<_> = (0..4).map(|_| scope.spawn(create)).collect();
+            threads.into_iter().flat_map(|thread| thread.join().unwrap()).collect::<Vec<_>>()
+        });
+        paths.sort();
+        paths.dedup();
+        assert_eq!(paths.len(), 100);
+    }
+
+    #[test]
+    fn a_second_process_is_refused_and_left_overs_are_removed() {
+        let scratch = tempfile::tempdir().unwrap();
+        let path = scratch.path().join("run");
+        std::fs::create_dir(&path).unwrap();
+        std::fs::write(path.join(".model.safetensors-unfinished-x"), "half").unwrap();
+        let (folder, lock) = RunFolder::create(&path).unwrap();
+        assert_eq!(std::fs::read_dir(&path).unwrap().count(), 1, "only the lock");
+        assert!(folder.lock().unwrap_err().to_string().contains("another process works on this run"));
+        drop(lock);
+        assert!(folder.lock().is_ok());
     }
 
     #[test]

@@ -7,7 +7,7 @@ use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 use std::fs::File;
 use std::path::PathBuf;
-use std::sync::atomic::{AtomicU8, Ordering};
+use std::sync::atomic::{AtomicU8, AtomicU32, Ordering};
 use std::sync::{Mutex, OnceLock, PoisonError};
 
 /// Locks that guard the making of file slots; several, so that threads seldom wait for each other.
@@ -54,6 +54,8 @@ pub struct ImageCache {
     /// `None` inside for an image that cannot be made.
     memory: Vec<OnceLock<Option<Box<[u8]>>>>,
     states: Vec<AtomicU8>,
+    /// CRC-32 of each image in the file.
+    checksums: Vec<AtomicU32>,
     file: Option<Store>,
     stripes: [Mutex<()>; STRIPES],
 }
@@ -70,6 +72,7 @@ impl ImageCache {
             bytes_per_image,
             memory: (0..in_memory).map(|_| OnceLock::new()).collect(),
             states: (in_memory..images).map(|_| AtomicU8::new(EMPTY)).collect(),
+            checksums: (in_memory..images).map(|_| AtomicU32::new(0)).collect(),
             file: overflows.then(|| Store::new(spec)).transpose()?,
             stripes: [const { Mutex::new(()) }; STRIPES],
         })
@@ -113,6 +116,7 @@ impl ImageCache {
                 }
                 if let Some(file) = &self.file {
                     file.write(buffer, offset)?;
+                    self.checksums[i].store(checksum(buffer), Ordering::Relaxed);
                     state.store(IN_FILE, Ordering::Release);
                 }
                 return Ok(Some(buffer));
@@ -122,11 +126,22 @@ impl ImageCache {
         match (&self.file, state.load(Ordering::Acquire)) {
             (Some(file), IN_FILE) => {
                 file.read(buffer, offset)?;
+                // What the disk has damaged is made again.
+                if checksum(buffer) != self.checksums[i].load(Ordering::Relaxed) && !make(buffer) {
+                    return Ok(None);
+                }
                 Ok(Some(buffer))
             }
             _ => Ok(None),
         }
     }
+}
+
+/// CRC-32 of an image.
+fn checksum(image: &[u8]) -> u32 {
+    let mut crc = flate2::Crc::new();
+    crc.update(image);
+    crc.sum()
 }
 
 /// The temporary file. It has no name (or is deleted when it is closed), so a run that is killed leaves nothing behind.
@@ -224,6 +239,25 @@ mod tests {
     use super::*;
     use rayon::prelude::*;
     use std::sync::atomic::AtomicUsize;
+
+    #[test]
+    fn an_image_that_the_disk_damaged_is_made_again() {
+        let spec = CacheSpec { memory_bytes: 0, ..CacheSpec::default() };
+        let cache = ImageCache::new(3, 10, &spec).unwrap();
+        let makes = AtomicUsize::new(0);
+        let get = |i: usize| {
+            let mut buffer = [0; 10];
+            let made = |image: &mut [u8]| {
+                image.fill(i as u8 + 1);
+                makes.fetch_add(1, Ordering::Relaxed);
+                true
+            };
+            cache.get(i, &mut buffer, made).unwrap().map(<[u8]>::to_vec)
+        };
+        (0..3).for_each(|i| drop(get(i)));
+        cache.file.as_ref().unwrap().write(&[2, 2, 2, 2, 2, 2, 2, 2, 2, 3], 10).unwrap();
+        assert_eq!((get(1), get(2), makes.into_inner()), (Some(vec![2; 10]), Some(vec![3; 10]), 4));
+    }
 
     fn check(spec: &CacheSpec, in_memory: usize, makes_per_image: usize) {
         let cache = ImageCache::new(100, 10, spec).unwrap();

@@ -30,7 +30,7 @@ pub use predictor::Predictor;
 pub use spec::LayerSpec;
 pub use step_input::StepInput;
 pub use step_profile::StageTime;
-pub use structure::{NamedLayer, Network, group_digits};
+pub use structure::{MAX_PARAMETERS, NamedLayer, Network, group_digits};
 pub use training::TrainingPlan;
 
 pub use crate::engine::parameters::{Parameters, Tensor};

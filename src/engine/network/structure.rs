@@ -41,6 +41,10 @@ pub struct NamedLayer {
     pub frozen: bool,
 }
 
+/// Largest number of parameters of a network: 400 MB, and several times that in training. A recipe or a model file cannot ask
+/// for more memory than that.
+pub const MAX_PARAMETERS: usize = 100_000_000;
+
 impl Network {
     /// The network of `specs` over images of `input`, computed with `backend`: an [`Isa`], or one with a convolution algorithm.
     ///
@@ -62,7 +66,14 @@ impl Network {
                 [(layer.params(), &mut params_end, true), (layer.statistics(), &mut statistics_end, false)]
             {
                 for spec in specs {
-                    let range = *end..*end + spec.len();
+                    let len = spec.shape.iter().try_fold(1usize, |len, n| len.checked_mul(*n));
+                    let Some(len) = len.filter(|len| *len <= MAX_PARAMETERS - *end) else {
+                        let message = format!(
+                            "the network has more than {MAX_PARAMETERS} parameters; take fewer units or channels"
+                        );
+                        return Err(Error::Network { layer: name.clone(), message });
+                    };
+                    let range = *end..*end + len;
                     *end = range.end;
                     let name = format!("{name}.{}", spec.name);
                     network.tensors.push(Tensor { name, spec, trainable, range, frozen: false });

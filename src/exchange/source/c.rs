@@ -25,7 +25,10 @@ fn write_to(text: &mut String, program: &Program) -> std::fmt::Result {
          STEER_FULL_LOCK_DEG it is degrees of the front wheels. The image is {height} rows of {width} pixels, each red, green, \
          blue.\n * \
          An image of another size has to be scaled to that before. The buffers below are {} KiB, so only one thread\n * \
-         at a time may call it; nothing is allocated.\n */",
+         at a time may call it; nothing is allocated.\n *\n * \
+         The caller must check that the camera's frame was decoded without an error, is complete and new, and that the\n * \
+         result is finite (x == x and fabsf(x) < INFINITY), and clamp it to [-1, 1]. Without such a frame, hold the last\n * \
+         good angle for at most 0.5 s, with the throttle off, and then brake.\n */",
         recipe.name,
         env!("CARGO_PKG_VERSION"),
         kib.div_ceil(1024)

@@ -54,6 +54,10 @@ fn write_to(text: &mut String, program: &Program) -> std::fmt::Result {
         text,
         "    /// The steering for a camera image in RGB, row by row: roughly in [-1, 1], positive to the right, not clamped;\n    \
          /// times [`FULL_LOCK_DEG`] it is degrees of the front wheels. An image of another size has to be scaled before.\n    \
+         ///\n    \
+         /// The caller must check that the camera's frame was decoded without an error, is complete and new, and that the\n    \
+         /// result is finite, and clamp it to [-1, 1]. Without such a frame, hold the last good angle for at most 0.5 s, with\n    \
+         /// the throttle off, and then brake.\n    \
          pub fn steer(&mut self, image: &[u8; HEIGHT * WIDTH * 3]) -> f32 {{\n        let Model {{ {names} }} = self;"
     )?;
     for step in &program.statements {

@@ -4,7 +4,9 @@ use std::path::{Path, PathBuf};
 
 use crate::dataset::{self, View};
 use crate::error::{Error, Result};
-use crate::picture::{RgbImage, decode::decode_rgb};
+use crate::files::limits::read_up_to;
+use crate::picture::RgbImage;
+use crate::picture::decode::{MAX_FILE_LEN, decode_rgb};
 use crate::simulator::camera::jpeg::RoundTrip;
 use crate::simulator::recorder::expert_drive::drive_expert;
 use crate::simulator::recorder::sample::Sample;
@@ -110,7 +112,7 @@ impl Footage {
         match self {
             Footage::Files(files) => {
                 let path: &Path = &files[i].0;
-                let bytes = std::fs::read(path).map_err(Error::io(path))?;
+                let bytes = read_up_to(path, MAX_FILE_LEN, "a picture")?;
                 decode_rgb(&bytes, image).map_err(|message| Error::data(path, message))
             }
             Footage::Drive { track, variant, samples } => {

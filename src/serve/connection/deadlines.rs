@@ -119,6 +119,7 @@ impl Connection<'_, '_> {
             self.last_question = now;
             let text = format_args!("{}: no telemetry for {:.1} s", self.address, silent.as_secs_f64());
             self.shared.journal.report(Incident::Stale, text);
+            // The client may read no further command, so this one must not drive it backwards.
             let command = self.helm.cut_throttle();
             return self.steer(command);
         }

@@ -33,15 +33,17 @@ impl Connection<'_, '_> {
             self.overridden = false;
             self.shared.journal.step(format_args!("{}: the model drives again", self.address));
         }
+        let time = telemetry.time_s.map_or(FrameTime::Arrival(arrived), FrameTime::Simulated);
+        let blind = (time, telemetry.speed_mph);
         let Some(image) = &telemetry.image else {
-            return self.bad_telemetry(Incident::NoImage, format_args!("telemetry without an image"));
+            return self.bad_telemetry(Incident::NoImage, format_args!("telemetry without an image"), blind);
         };
         let Some(speed_mph) = telemetry.speed_mph else {
-            return self.bad_telemetry(Incident::NoSpeed, format_args!("telemetry without a speed"));
+            return self.bad_telemetry(Incident::NoSpeed, format_args!("telemetry without a speed"), blind);
         };
         let steering = match self.look(image) {
             Ok(steering) => steering,
-            Err(text) => return self.bad_telemetry(Incident::UnreadableImage, format_args!("{text}")),
+            Err(text) => return self.bad_telemetry(Incident::UnreadableImage, format_args!("{text}"), blind),
         };
         match self.shared.seat.claim(self.peer.id, &self.peer.stream, Instant::now()) {
             Claim::Kept => {}
@@ -55,7 +57,6 @@ impl Connection<'_, '_> {
         }
         self.faults = 0;
         self.lockstep = telemetry.time_s.is_some();
-        let time = telemetry.time_s.map_or(FrameTime::Arrival(arrived), FrameTime::Simulated);
         let command = self.helm.command(steering, speed_mph, time);
         self.steer(command)?;
         self.cut = false;
@@ -117,17 +118,22 @@ impl Connection<'_, '_> {
         self.ask()
     }
 
-    /// Reports telemetry that cannot be used, and answers it.
-    fn bad_telemetry(&mut self, incident: Incident, text: std::fmt::Arguments) -> Result<(), End> {
+    /// Reports telemetry that cannot be used, and answers it with its time and speed.
+    fn bad_telemetry(
+        &mut self,
+        incident: Incident,
+        text: std::fmt::Arguments,
+        (time, speed_mph): (FrameTime, Option<f64>),
+    ) -> Result<(), End> {
         self.fault(incident, text)?;
-        self.answer_blind()
+        self.answer_blind(time, speed_mph)
     }
 
-    /// Answers telemetry that cannot be used, so that the car does not wait for ever: the driven client gets its throttle cut,
-    /// another one is asked again.
-    pub(super) fn answer_blind(&mut self) -> Result<(), End> {
+    /// Answers telemetry that cannot be used, so that the car does not wait for ever: the helm holds the driven client's
+    /// steering and then brakes; another client is asked again.
+    pub(super) fn answer_blind(&mut self, time: FrameTime, speed_mph: Option<f64>) -> Result<(), End> {
         if self.shared.seat.is_held_by(self.peer.id, Instant::now()) {
-            let command = self.helm.cut_throttle();
+            let command = self.helm.without_frame(time, speed_mph);
             self.steer(command)
         } else {
             self.ask()

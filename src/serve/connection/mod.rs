@@ -13,7 +13,7 @@ use tungstenite::{Message, Utf8Bytes, WebSocket};
 
 use self::opening::open;
 use super::handshake::ClientInfo;
-use super::helm::Helm;
+use super::helm::{FrameTime, Helm};
 use super::journal::Incident;
 use super::rate_limit::RateLimit;
 use super::shared::Shared;
@@ -297,7 +297,11 @@ impl Connection<'_, '_> {
                 };
                 self.fault(incident, format_args!("{error}"))?;
                 // It may have been telemetry for which the client waits for an answer.
-                if incident == Incident::BrokenEvent { self.answer_blind() } else { Ok(()) }
+                if incident == Incident::BrokenEvent {
+                    self.answer_blind(FrameTime::Arrival(Instant::now()), None)
+                } else {
+                    Ok(())
+                }
             }
         }
     }
