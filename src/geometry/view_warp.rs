@@ -35,12 +35,13 @@ impl PixelGrid {
     }
 
     /// From (column, row, 1) of this picture to that of the camera's.
-    fn to_camera(self) -> Matrix {
+    fn picture_to_camera(self) -> Matrix {
         let ([y, x], [sy, sx]) = (self.origin, self.scale);
         Matrix([[sx, 0.0, x], [0.0, sy, y], [0.0, 0.0, 1.0]])
     }
 
-    fn from_camera(self) -> Matrix {
+    /// From (column, row, 1) of the camera's picture to that of this one.
+    fn camera_to_picture(self) -> Matrix {
         let ([y, x], [sy, sx]) = (self.origin, self.scale);
         Matrix([[1.0 / sx, 0.0, -x / sx], [0.0, 1.0 / sy, -y / sy], [0.0, 0.0, 1.0]])
     }
@@ -68,11 +69,11 @@ impl ViewWarp {
     pub fn between(geometry: &CarGeometry, grid: PixelGrid, taken_m: f64, offset: Offset, wanted_m: f64) -> ViewWarp {
         // Coordinates are right, up, ahead. Rays of the wanted camera in its car's axes:
         let mount = rotation(geometry);
-        let rays = mount * lens(geometry).inverse_of_lens() * grid.to_camera();
+        let rays = mount * lens(geometry).inverse_of_lens() * grid.picture_to_camera();
         // A turn to the right by t takes the displaced car's (right, ahead) into the first car's.
         let (sin, cos) = (libm::sin(offset.turn), libm::cos(offset.turn));
         let turn = Matrix([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]]);
-        let to_picture = grid.from_camera() * lens(geometry) * mount.transposed();
+        let to_picture = grid.camera_to_picture() * lens(geometry) * mount.transposed();
         let far = to_picture * turn * rays;
         // A ray (x, y, z) with y < 0 meets the ground at (wanted_m + x h / -y, 0, ahead + z h / -y) of the displaced car. With the
         // weight -y the point is linear in the ray; so is its place seen from the camera that took the picture.

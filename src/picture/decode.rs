@@ -349,7 +349,7 @@ mod tests {
     #[test]
     fn whether_a_picture_is_damaged_is_decided_by_its_data() {
         let (width, height) = (320, 160);
-        let noisy: Vec<u8> = (0..width * height * 3).map(|i| (i * 2_654_435_761_usize >> 7) as u8 / 2).collect();
+        let noisy: Vec<u8> = (0..width * height * 3).map(|i| ((i * 2_654_435_761_usize) >> 7) as u8 / 2).collect();
         for pixels in [noisy, gradient(width, height), vec![90; width * height * 3]] {
             for factor in [jpeg_encoder::SamplingFactor::F_1_1, jpeg_encoder::SamplingFactor::F_2_2] {
                 for restart in [0, 7] {

@@ -84,9 +84,11 @@ fn errors(log: &ReplayLog, frames: &mut Frames, row: usize) -> Result<[f64; 2]> 
                     continue;
                 }
                 let at = (y * centre.width + x) * 3;
-                for i in at..at + 3 {
-                    sums[0] += u64::from(real.pixels[i].abs_diff(predicted[i]));
-                    sums[1] += u64::from(real.pixels[i].abs_diff(centre.pixels[i]));
+                let [real, predicted, centre] =
+                    [&real.pixels, &predicted, &centre.pixels].map(|pixels| &pixels[at..at + 3]);
+                for ((real, predicted), centre) in real.iter().zip(predicted).zip(centre) {
+                    sums[0] += u64::from(real.abs_diff(*predicted));
+                    sums[1] += u64::from(real.abs_diff(*centre));
                 }
                 n += 3;
             }
