@@ -164,6 +164,8 @@ fn labels_are_never_wrong_without_a_word() {
         tree.insert(name.into(), text.as_bytes().to_vec());
         tree
     };
+    // One bend is sharp enough to tell degrees from radians.
+    let sharp = logged(HEADER, |row, names, s| usual(names, if row == 20 { 12.5 } else { s * 25.0 }));
     // Three labels of a straight drive are beyond 1.
     let few = logged(HEADER, |row, names, s| usual(names, if row % 13 == 5 { 17.0 } else { s * 0.1 }));
     let tub = |mode: &'static str| {
@@ -210,7 +212,7 @@ fn labels_are_never_wrong_without_a_word() {
             &["steersman.toml", "colour"],
             0,
         ),
-        case("degrees", scaled(25.0, 0.0), &["degrees of the front wheels", "--unit degrees"], 0),
+        case("degrees", sharp, &["degrees of the front wheels", "--unit degrees"], 0),
         Case { said: said("unit = 'degrees'"), ..case("degrees, --unit", scaled(25.0, 0.0), &[], ROWS) },
         Case { said: said("unit = 'radians'"), ..case("radians, --unit", scaled(25f64.to_radians(), 0.0), &[], ROWS) },
         case("servo", scaled(45.0, 90.0), &["servo", "--unit servo"], 0),

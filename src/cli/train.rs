@@ -204,11 +204,12 @@ fn plan(recipe: &Recipe, scope: &Scope, dagger_rounds: u32, threads: usize) -> R
 struct Claimed(Option<PathBuf>);
 
 impl Claimed {
-    /// Removes the folder if the run ended before it had put anything there.
+    /// Removes the folder if the run ended before it had put anything there, and `runs/` if it was made for it.
     fn settle<T>(self, result: Result<T>) -> Result<T> {
         if let (Err(_), Some(path)) = (&result, &self.0) {
-            // A folder with something in it stays.
+            // A folder with something in it stays; so does `runs/` with other runs in it.
             let _ = std::fs::remove_dir(path);
+            let _ = path.parent().map(std::fs::remove_dir);
         }
         result
     }

@@ -352,6 +352,10 @@ mod tests {
         note.write(folder.path()).unwrap();
         assert_eq!(JobNote::read(folder.path()).unwrap(), Some(note));
         std::fs::write(folder.path().join(RunFolder::JOB_NOTE), "{\n\"runs\": true}").unwrap();
+        let damaged = JobNote::read(folder.path()).unwrap_err().to_string();
+        assert!(damaged.contains("checksums.txt"), "{damaged}");
+        // A folder of before there were digests.
+        std::fs::remove_file(folder.path().join("checksums.txt")).unwrap();
         let error = JobNote::read(folder.path()).unwrap_err().to_string();
         assert!(error.contains("main-job.json:2"), "{error}");
     }

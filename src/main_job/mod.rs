@@ -62,7 +62,7 @@ pub struct MainJobResult {
 ///
 /// # Errors
 ///
-/// As [`drive()`] and [`write_trajectories`].
+/// As [`drive()`] and `write_trajectories`.
 pub fn test_on_track(
     pilot: &Pilot,
     track: &Track,

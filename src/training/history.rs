@@ -45,7 +45,7 @@ pub(super) fn history_csv(path: &Path, history: &[EpochRecord]) -> Result<Vec<u8
     writer.into_inner().map_err(|e| Error::data(path, e.to_string()))
 }
 
-/// Reads what [`history_csv`] made.
+/// Reads what `history_csv` made.
 ///
 /// # Errors
 ///

@@ -25,7 +25,7 @@ pub fn write(folder: &Path, rows: usize, suffix: &str) -> PathBuf {
         let mut names = Vec::new();
         for (camera, shift_px) in [("center", 0.0), ("left", 18.0), ("right", -18.0)] {
             let name = format!("IMG/{camera}_{time}{suffix}.jpg");
-            fs::write(folder.join(&name), picture(160.0 + shift_px + SWING_PX * steering(row))).unwrap();
+            fs::write(folder.join(&name), picture(row, 160.0 + shift_px + SWING_PX * steering(row))).unwrap();
             names.push(name);
         }
         writeln!(log, "{}, {}, {}, {}, 0.8, 0, 20.5", names[0], names[1], names[2], steering(row)).unwrap();
@@ -35,9 +35,13 @@ pub fn write(folder: &Path, rows: usize, suffix: &str) -> PathBuf {
     path
 }
 
-/// A JPEG of 320x160 pixels with a saturated stripe around column `middle_px`.
-fn picture(middle_px: f64) -> Vec<u8> {
+/// A JPEG of 320x160 pixels with a saturated stripe around column `middle_px`. The upper left corner spells `row` in squares, so that
+/// no two rows have the same picture.
+fn picture(row: usize, middle_px: f64) -> Vec<u8> {
     let image = RgbImage::from_fn(320, 160, |x, y| {
+        if y < 8 && x < 128 {
+            return image::Rgb(if row >> (x / 8) & 1 == 1 { [250; 3] } else { [5; 3] });
+        }
         let distance = (f64::from(x) - middle_px).abs();
         if distance < 12.0 { image::Rgb([230, 60, 40]) } else { image::Rgb([90, 90, 80 + (y / 4) as u8]) }
     });

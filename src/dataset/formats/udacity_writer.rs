@@ -1,4 +1,4 @@
-//! Writing what [`udacity`](super::udacity) reads: lines of a `driving_log.csv`, and names of pictures that carry their time.
+//! Writing what the module `udacity` reads: lines of a `driving_log.csv`, and names of pictures that carry their time.
 
 use std::fmt::Display;
 use std::io::{self, Write};

@@ -199,7 +199,7 @@ impl Spread {
 /// read, the log alone is described. `observer` is told the share of the pictures that is done.
 ///
 /// # Errors
-/// As [`load_with`](super::load_with); the observer's own.
+/// As [`load_with`]; the observer's own.
 pub fn inspect(path: &Path, said: &Description, observer: &mut (dyn Observer<Progress> + Send)) -> Result<Inspection> {
     let checked = load_with(path, said, ImageCheck::Verify)?;
     if checked.rows.is_empty() && checked.total_rows() > 0 {

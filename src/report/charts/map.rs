@@ -1,5 +1,5 @@
 //! A track from above, with the way a car took, coloured by its distance from the line. The colours cover the range of
-//! [`RANGES_M`] that most of the way lies in.
+//! `RANGES_M` that most of the way lies in.
 
 use super::chart::NARROW;
 use super::palette::{INK, QUIET_INK, ROAD, ROAD_EDGE, heat_hex};
@@ -49,7 +49,7 @@ pub fn write(track: &Track, result: &DriveResult, folder: &NewFolder) -> Result<
     written.map_err(|source| folder.explain(Error::Io { path, source }))
 }
 
-/// The distance from the line, m, that has the darkest colour where a car was as far from it as `cte_m`: of [`RANGES_M`] the
+/// The distance from the line, m, that has the darkest colour where a car was as far from it as `cte_m`: of `RANGES_M` the
 /// smallest that covers nearly all of them.
 pub(crate) fn darkest_m(cte_m: impl Iterator<Item = f64>) -> f64 {
     let mut sorted: Vec<f64> = cte_m.map(f64::abs).filter(|m| m.is_finite()).collect();

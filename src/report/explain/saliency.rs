@@ -180,7 +180,7 @@ impl Saliency {
     }
 
     /// Turns the rows of `image` that the network sees to grey, and colours what excited it as
-    /// [`palette::saliency`](crate::report::charts::palette::saliency) says. Rows that are cut off keep their colours.
+    /// [`palette::saliency`] says. Rows that are cut off keep their colours.
     /// `preprocessing` is the network's own. Before the first picture nothing is changed.
     pub fn overlay(&self, preprocessing: &Preprocessing, image: &mut RgbImage) {
         let ([map_h, map_w], [first, end]) = (self.size, preprocessing.rows);

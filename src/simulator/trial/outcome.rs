@@ -72,7 +72,7 @@ pub struct Trial {
 }
 
 impl Trial {
-    /// [`autonomy_percent`] of the trial.
+    /// Autonomy of the trial, %: see the function of this name.
     pub fn autonomy_percent(&self) -> f64 {
         autonomy_percent(self.interventions, self.time_s)
     }
@@ -116,4 +116,16 @@ pub struct TrialOptions {
     pub noise: f64,
     /// Put the car back when it is too far from the line, instead of ending the trial when it fails.
     pub assisted: bool,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_intervention_costs_six_seconds() {
+        assert_eq!(autonomy_percent(0, 100.0), 100.0);
+        assert_eq!(autonomy_percent(3, 100.0), 82.0);
+        assert_eq!(autonomy_percent(20, 100.0), 0.0);
+    }
 }

@@ -67,7 +67,7 @@ pub struct DriveSummary {
     pub completed_low: f64,
     /// See `completed_low`.
     pub completed_high: f64,
-    /// Autonomy over the assisted trials, %, see [`autonomy_percent`](super::outcome::autonomy_percent).
+    /// Autonomy over the assisted trials, %, 6 s are charged for each intervention.
     pub autonomy_percent: f64,
     /// Times the car was put back in assisted runs.
     pub interventions: usize,
