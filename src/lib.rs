@@ -160,6 +160,10 @@
 //! ```
 #![doc = include_str!("glossary.md")]
 #![forbid(unsafe_code)]
+#![cfg_attr(
+    all(feature = "training", not(feature = "cli")),
+    allow(dead_code, unused_imports, reason = "the smaller feature sets use a part of what the rooms share")
+)]
 
 #[cfg(feature = "cli")]
 pub mod cli;
@@ -182,7 +186,6 @@ pub mod metrics;
 #[cfg(feature = "training")]
 pub mod model_file;
 #[cfg(any(feature = "live", feature = "serve"))]
-#[cfg_attr(not(feature = "serve"), allow(dead_code, reason = "the live page alone needs a part of it"))]
 mod net;
 #[cfg(feature = "training")]
 pub mod observer;
@@ -206,7 +209,6 @@ pub mod simulator_client;
 mod statistics;
 mod suggestion;
 #[cfg(feature = "training")]
-#[cfg_attr(not(feature = "cli"), allow(dead_code, reason = "the smaller feature sets show less foreign text"))]
 mod text;
 #[cfg(feature = "training")]
 pub mod training;

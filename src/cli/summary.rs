@@ -103,15 +103,15 @@ pub fn run(args: SummaryArgs) -> Result<()> {
 fn about(model: &Model) -> String {
     let (record, recipe) = (&model.record, &model.recipe);
     let trained = if record.epochs == 0 && record.recordings.is_empty() {
-        "not here".into()
+        "not trained here".into()
     } else {
         let on = match &record.recordings[..] {
             [only] => only.clone(),
             several => counted(several.len(), "recording"),
         };
         let (epochs, seed, isa) = (counted(record.epochs as usize, "epoch"), record.seed, &record.isa);
-        format!("{epochs} on {on}, seed {seed}, {isa}")
+        format!("trained {epochs} on {on}, seed {seed}, {isa}")
     };
     let error = or_dash(record.val_mse, 4);
-    format!("recipe {}: {}\ntrained {trained}\nvalidation MSE {error}\n", recipe.name, recipe.about)
+    format!("recipe {}: {}\n{trained}\nvalidation MSE {error}\n", recipe.name, recipe.about)
 }
