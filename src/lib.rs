@@ -3,7 +3,7 @@
 //!
 //! # A tour
 //!
-//! | room | what happens there |
+//! | room (module) | what happens there |
 //! |---|---|
 //! | [`dataset`] | reads a recording, splits it *before* anything is augmented, decodes each picture once and preprocesses it |
 //! | [`recipe`] | the experiment: preprocessing, network, samples, split, optimizer |
@@ -24,7 +24,7 @@
 //! # Three promises
 //!
 //! - **The same bits.** Every random choice is keyed by seed, purpose, epoch and sample ([`random`](engine::random)), and sums are added in
-//!   an order that does not depend on the number of threads. On one level of vector code, a seed gives the same weights on
+//!   an order that does not depend on the number of threads. On the same instruction set, a seed gives the same weights on
 //!   any number of threads, with or without a cache, stopped and resumed or not.
 //! - **No allocation** in a training step or a prediction once the buffers are planned.
 //! - **Evaluation changes nothing**: it borrows the parameters shared.

@@ -8,7 +8,7 @@ use super::progress::JobDisplay;
 use super::{RecipeArgs, or_dash, pool, print_json, refuse_existing, stop_on_ctrl_c};
 use crate::dataset::held_out::{self, trained_on_held_out};
 use crate::error::{Error, Result};
-use crate::main_job::experiment::{self, ExperimentEvent, ExperimentRow, Plan, Subject, takes, write_csv};
+use crate::main_job::experiment::{self, ExperimentEvent, ExperimentPlan, ExperimentRow, Subject, takes, write_csv};
 use crate::main_job::job::{RECORDINGS, training_set};
 use crate::main_job::training_set::RANDOM_TRACKS;
 use crate::observer::Observer;
@@ -102,7 +102,7 @@ pub fn run(args: ExperimentArgs) -> Result<()> {
         SubjectArg::Split => Subject::Split,
         SubjectArg::Colour => Subject::Colour,
     };
-    let plan = Plan { subject, recipe, seeds, recordings, tracks, runs, cache_mib: args.cache };
+    let plan = ExperimentPlan { subject, recipe, seeds, recordings, tracks, runs, cache_mib: args.cache };
     let mut done = Vec::new();
     let mut observer = |event| match event {
         ExperimentEvent::Job(event) => display.observe(event),
@@ -149,7 +149,7 @@ fn new_csv(out: Option<PathBuf>, subject: SubjectArg) -> Result<PathBuf> {
     Ok(out)
 }
 
-fn print_table(plan: &Plan, trials: &[ExperimentRow]) {
+fn print_table(plan: &ExperimentPlan, trials: &[ExperimentRow]) {
     println!(
         "recipe {}, {} epochs, {} recordings; {} trainings of each; driven: {}, {} runs of a lap on each",
         plan.recipe.name,

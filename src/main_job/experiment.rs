@@ -58,7 +58,7 @@ impl Subject {
 
 /// An experiment.
 #[derive(Clone, Debug)]
-pub struct Plan {
+pub struct ExperimentPlan {
     /// The setting that is varied.
     pub subject: Subject,
     /// What stays the same.
@@ -129,7 +129,7 @@ pub fn takes(random_tracks: usize) -> Vec<training_set::Take> {
 ///
 /// As [`training::train`] and [`test_on_tracks`]; [`Error::Interrupted`] if `stop` is requested.
 pub fn run(
-    plan: &Plan,
+    plan: &ExperimentPlan,
     observer: &mut (dyn Observer<ExperimentEvent> + Send),
     stop: &StopSignal,
 ) -> Result<Vec<ExperimentRow>> {

@@ -14,6 +14,10 @@
 //! Telemetry circulates like a token: the client sends one when the connection opens, one for each open packet of Engine.IO,
 //! and one for each `steer` and each `manual`. A server that answers each telemetry once keeps all tokens; a reply that the
 //! client cannot read loses one.
+//!
+//! To imitate the client of another simulator, write a module beside this one, with a command in `cli/` and a line in `tests/rooms.rs`.
+//! To let another simulator connect to the server, put its messages beside [`udacity`](crate::udacity) and its side of the talk into
+//! `serve/connection/`.
 
 mod frame_clock;
 mod frames;

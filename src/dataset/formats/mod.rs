@@ -24,7 +24,7 @@ use super::store::Store;
 use crate::{Error, Result};
 pub(crate) use foreign::name_of_foreign;
 
-/// A way to write recordings.
+/// A format of recordings that can be read.
 #[derive(Debug)]
 pub(crate) struct Format {
     /// Name in JSON.

@@ -1,8 +1,9 @@
 //! A training step: forward, loss, backward, over fixed shards of the batch.
 //!
-//! The batch is cut into at most [`MAX_SHARDS`] shards whose borders depend on the batch size alone. Each shard has
-//! activations, a gradient arena and scratch of its own, and is worked on by one thread; gradients and batch-norm sums are
-//! added in the order of the shards. So the result has the same bits for any number of threads.
+//! The batch is cut into at most [`MAX_SHARDS`] shards whose borders depend on the batch size alone. Each shard has a
+//! gradient arena of its own and is worked on by one thread; scratch, and without a barrier the activations too, are borrowed from a
+//! pool. Gradients and batch-norm sums are added in the order of the shards. So the result has the same bits for any number of
+//! threads.
 //!
 //! Between two batch-norm barriers a shard takes a group of a few images through all layers, so that the output of one layer is
 //! still in the cache when the next layer reads it. A network without batch norm has no barrier: each group goes forward *and*
