@@ -7,7 +7,7 @@ use std::path::Path;
 
 use steersman::Error;
 use steersman::dataset::Description;
-use steersman::main_job::experiment::{self, ExperimentEvent, Plan, Subject, write_csv};
+use steersman::main_job::experiment::{self, ExperimentEvent, ExperimentPlan, Subject, write_csv};
 use steersman::main_job::job::{Job, JobEvent, JobNote, JobRequest, Scope};
 use steersman::main_job::training_set::{Take, recordings};
 use steersman::main_job::{TrackResult, test_on_track};
@@ -136,7 +136,7 @@ fn the_experiments_train_and_drive_every_variant() {
     let scope = small_scope(folder.path());
     let recordings = recordings(&scope.recordings, &scope.takes, &mut Unobserved).unwrap().0;
     let go = |subject, stop: &StopSignal| {
-        let plan = Plan {
+        let plan = ExperimentPlan {
             subject,
             recipe: lenet(1),
             seeds: 2,
