@@ -97,6 +97,16 @@ impl CarGeometry {
         libm::tan(self.wheel_angle(steering)) / self.wheelbase_m
     }
 
+    /// The steering that leads the rear axle to a point `right_m` aside and `ahead_m` ahead, `look_ahead_m` along the path; it may lie
+    /// beyond [-1, 1].
+    ///
+    /// The circle through the rear axle, tangent to the car, that meets a point `right` aside at the distance `l` has the curvature
+    /// `2 right / l²`. A distance that is shorter than half the way along the path counts as half of it.
+    pub fn steering_towards(&self, right_m: f64, ahead_m: f64, look_ahead_m: f64) -> f64 {
+        let square = (right_m * right_m + ahead_m * ahead_m).max(0.25 * look_ahead_m * look_ahead_m);
+        self.steering_for(2.0 * right_m / square)
+    }
+
     /// The steering whose path has the curvature `curvature`, 1/m; beyond [-1, 1] if the car cannot turn as sharply.
     pub fn steering_for(&self, curvature: f64) -> f64 {
         libm::atan(curvature * self.wheelbase_m).to_degrees() / self.full_lock_deg
