@@ -11,6 +11,7 @@
 //! recording for people.
 
 mod description;
+mod driven;
 mod formats;
 pub mod held_out;
 pub mod inspect;
@@ -23,6 +24,7 @@ mod store;
 mod unusable;
 
 pub use description::{Column, ColumnRef, DESCRIPTION_FILE, Description, Labels, Unit, parse_columns};
+pub use driven::{DrivenSession, DrivenSessions};
 pub use formats::{table as table_of_formats, udacity_writer};
 pub use load::{load, load_with, recordings_below};
 pub use pictures::{cache, colour, preprocess, resize};

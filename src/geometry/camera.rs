@@ -72,6 +72,11 @@ const DONKEYCAR: CarGeometry = CarGeometry {
 };
 
 impl CarGeometry {
+    /// Name of the preset for recordings that say nothing of their camera.
+    pub const USUAL: &str = "udacity";
+    /// Name of the preset for small cars that say nothing of their camera.
+    pub const USUAL_SMALL: &str = "donkeycar";
+
     /// Names of the presets, each with what it stands for.
     pub fn presets() -> impl Iterator<Item = (&'static str, &'static str)> {
         PRESETS.iter().map(|(name, about, _)| (*name, *about))
