@@ -18,7 +18,7 @@ use crate::dataset::split::SplitSpec;
 use crate::dataset::{Balance, LabelSpec, Recording, SampleSpec, Targets};
 use crate::engine::loss::Loss;
 use crate::engine::network::{LayerSpec, Network};
-use crate::engine::optimizer::{OptimizerSpec, Schedule, ScheduleSpec};
+use crate::engine::optimizer::{AveragingSpec, OptimizerSpec, Schedule, ScheduleSpec};
 use crate::engine::tensor::Shape;
 use crate::error::{Error, Result};
 use crate::suggestion::did_you_mean;
@@ -57,6 +57,9 @@ pub struct Recipe {
     /// Which epoch's weights become the model.
     #[serde(default)]
     pub keep: Keep,
+    /// The average of the weights over updates that is evaluated and becomes the model; the weights themselves when absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub averaging: Option<AveragingSpec>,
     /// The network, from input to output.
     pub layers: Vec<LayerSpec>,
     /// From camera image to network input.
@@ -232,6 +235,9 @@ impl Recipe {
             return Err(format!("loss.delta must be a positive number, not {delta}"));
         }
         self.optimizer.check().map_err(|message| format!("[optimizer] {message}"))?;
+        if let Some(averaging) = &self.averaging {
+            averaging.check().map_err(|message| format!("averaging: {message}"))?;
+        }
         self.schedule.check().map_err(|message| format!("[schedule] {message}"))?;
         self.preprocessing.validate().map_err(|e| e.to_string())?;
         self.labels.validate().map_err(|e| e.to_string())?;
@@ -351,6 +357,8 @@ mod tests {
         assert!(error(&["preprocessing.rows=[10, 200]"]).contains("rows"));
         assert!(error(&["preprocessing.resize=[4, 4]"]).contains("layer `pool1`"));
         assert!(error(&["keep=last", "early_stopping={patience_epochs=1}"]).contains("keeps the best epoch"));
+        assert!(error(&["averaging={kind='ema', decay=1}"]).contains("averaging: decay must lie in [0, 1)"));
+        assert!(error(&["averaging={kind='ema', decays=0.9}"]).contains("did you mean `decay`?"));
         assert!(error(&["name='../x'"]).contains("letters, digits"));
         assert!(error(&["early_stopping={patience_epochs=1}", "split.validation_share=0"]).contains("validation side"));
         assert!(error(&["layers=[{kind='dense', units=100000000000000}]"]).contains("units"));
