@@ -22,6 +22,7 @@ mod evaluate;
 mod experiment;
 mod explain;
 mod export;
+mod fit_camera;
 mod import;
 mod inspect;
 mod predict;

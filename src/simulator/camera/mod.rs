@@ -8,3 +8,6 @@ mod objects;
 pub mod pinhole;
 pub mod renderer;
 mod view;
+
+#[cfg(test)]
+mod mirror_tests;
