@@ -93,7 +93,7 @@ mod tests {
         assert!(text.contains("Session 1, from line 1: 267 m") && text.contains("`udacity` is assumed"), "{text}");
         assert!(!text.contains("no speed was recorded"));
         recording.rows.iter_mut().for_each(|row| row.speed_mph = f32::NAN);
-        assert!(page_of(&recording).contains("14.3 m/s is assumed"));
+        assert!(page_of(&recording).contains("14.4 m/s is assumed"));
         recording.rows.iter_mut().for_each(|row| row.speed_mph = 0.0);
         assert!(!page_of(&recording).contains("The driven path"), "a car that stands drives no path");
     }

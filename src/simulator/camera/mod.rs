@@ -8,6 +8,3 @@ mod objects;
 pub mod pinhole;
 pub mod renderer;
 mod view;
-
-#[cfg(test)]
-mod mirror_tests;
