@@ -7,7 +7,7 @@ use serde::Serialize;
 
 use super::recording_args::RecordingArgs;
 use super::share_bar::ShareBar;
-use super::{RecipeArgs, new_folder, pool, print, print_json, refuse_existing, stop_on_ctrl_c};
+use super::{RecipeArgs, end_with, new_folder, pool, print, print_json, refuse_existing, stop_on_ctrl_c};
 use crate::dataset::inspect::{Report, inspect};
 use crate::error::{Error, Result};
 use crate::files::atomic_file;
@@ -87,8 +87,5 @@ pub fn run(args: InspectArgs) -> Result<()> {
     if args.json {
         print_json(&reports)?;
     }
-    // The last one ends the command, those before it are told.
-    let last = failed.pop();
-    failed.iter().for_each(|error| eprintln!("error: {error}"));
-    last.map_or(Ok(()), Err)
+    end_with(failed)
 }

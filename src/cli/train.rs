@@ -7,6 +7,7 @@ use clap::Args;
 use steersman_kernels::Isa;
 use steersman_kernels::conv::ConvAlgorithm;
 
+use super::model_arg::model_file;
 use super::progress::{JobDisplay, TrainingDisplay};
 use super::recording_args::RecordingArgs;
 use super::words::counted;
@@ -90,7 +91,8 @@ pub fn run(args: TrainArgs) -> Result<()> {
     }
     let stop = stop_on_ctrl_c()?;
     let pool = pool(args.threads)?;
-    let from = args.from.map(|model| TransferRequest { model, freeze: args.freeze });
+    let from = args.from.as_deref().map(model_file).transpose()?;
+    let from = from.map(|model| TransferRequest { model, freeze: args.freeze });
     let recipe = || match &from {
         Some(from) => args.recipe.find_or_of(&from.model),
         None => args.recipe.find(),
