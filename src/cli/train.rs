@@ -18,6 +18,7 @@ use crate::main_job::job::{Job, JobNote, JobRequest, Scope};
 use crate::main_job::{MainJobResult, TrackResult};
 use crate::recipe::Recipe;
 use crate::report;
+use crate::text::percent;
 use crate::training::{self, RunFolder, TrainRequest, TrainResult, TransferRequest};
 
 /// Time of one core (Zen 3, 2.4 GHz) for recording and for driving, s.
@@ -256,11 +257,6 @@ fn explain_stop<T>(result: Result<T>, folder: Option<&Path>) -> Result<T> {
 
 /// A leak above this, in percent, is worth a word.
 const MUCH_LEAK: f64 = 3.0;
-
-/// A share in percent; one that is not 0 never reads as 0.
-fn percent(value: f64) -> String {
-    if value > 0.0 && value < 0.05 { "<0.1".into() } else { format!("{value:.1}") }
-}
 
 fn print_training(result: &TrainResult) {
     let twins = result.near_twin_percent.unwrap_or(0.0);

@@ -6,6 +6,7 @@ pub mod browser;
 pub mod command;
 pub mod double;
 pub mod formula;
+pub mod hammer;
 pub mod mp4;
 pub mod page;
 pub mod painted_log;
