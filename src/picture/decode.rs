@@ -388,6 +388,39 @@ mod tests {
     }
 
     #[test]
+    fn pictures_of_every_kind_of_colour_are_read_or_named() {
+        use image::ExtendedColorType::{L8, L16, La8, Rgb16, Rgba8};
+        let (width, height) = (24, 16);
+        let grey = |x: usize, y: usize| (x * 8 + y) as u8;
+        for colour in [L8, L16, La8, Rgb16, Rgba8] {
+            let channels = usize::from(colour.channel_count());
+            let bytes = usize::from(colour.bits_per_pixel()) / 8 / channels;
+            let value = |x: usize, y: usize, channel: usize| match (channels, channel) {
+                (2, 1) | (4, 3) => 255,
+                _ => grey(x, y),
+            };
+            let pixels: Vec<u8> = (0..height * width * channels)
+                .flat_map(|i| vec![value(i / channels % width, i / channels / width, i % channels); bytes])
+                .collect();
+            let mut png = Vec::new();
+            let encoder = image::codecs::png::PngEncoder::new(&mut png);
+            encoder.write_image(&pixels, width as u32, height as u32, colour).unwrap();
+            let mut image = RgbImage::default();
+            decode_rgb(&png, &mut image).unwrap();
+            assert_eq!((image.height, image.width), (height, width));
+            assert_eq!(image.pixel(3, 20), [grey(20, 3); 3], "{colour:?}");
+        }
+        let mut cmyk = Vec::new();
+        let encoder = jpeg_encoder::Encoder::new(&mut cmyk, 90);
+        encoder.encode(&[90; 24 * 16 * 4], 24, 16, jpeg_encoder::ColorType::Cmyk).unwrap();
+        let mut image = RgbImage::default();
+        match decode_rgb(&cmyk, &mut image) {
+            Ok(()) => assert_eq!((image.height, image.width), (height, width)),
+            Err(message) => assert!(message.contains("colours"), "{message}"),
+        }
+    }
+
+    #[test]
     fn broken_images_are_errors() {
         let whole = jpeg(&gradient(40, 24), 40, 24);
         let mut image = RgbImage::default();

@@ -178,9 +178,10 @@ impl Hammer {
             }
             drop(stop);
         });
-        let (peak, kept) = (self.memory.max_allocated() >> 20, self.memory.allocated().saturating_sub(allocated) >> 10);
+        let peak_mb = self.memory.max_allocated() as f64 / (1 << 20) as f64;
+        let kept_kb = self.memory.allocated().saturating_sub(allocated) >> 10;
         println!(
-            "{name:<44} {:>8} inputs, {refused:>8} noticed, slowest {slowest:>8.1?}, peak so far {peak:>4} MB, {kept} KB kept",
+            "{name:<44} {:>8} inputs, {refused:>8} noticed, slowest {slowest:>8.1?}, peak so far {peak_mb:>5.1} MB, {kept_kb} KB kept",
             accepted + refused
         );
         assert!(refused > 0, "{name}: damage that is never noticed is no damage");
