@@ -15,10 +15,10 @@ use steersman_kernels::{Backend, Isa};
 use crate::dataset::augment::Augmentation;
 use crate::dataset::preprocess::Preprocessing;
 use crate::dataset::split::SplitSpec;
-use crate::dataset::{Balance, SampleSpec};
+use crate::dataset::{Balance, LabelSpec, Recording, SampleSpec, Targets};
 use crate::engine::loss::Loss;
 use crate::engine::network::{LayerSpec, Network};
-use crate::engine::optimizer::{OptimizerSpec, Schedule, ScheduleSpec};
+use crate::engine::optimizer::{AveragingSpec, OptimizerSpec, Schedule, ScheduleSpec};
 use crate::engine::tensor::Shape;
 use crate::error::{Error, Result};
 use crate::suggestion::{did_you_mean, meant, named_elsewhere};
@@ -57,11 +57,17 @@ pub struct Recipe {
     /// Which epoch's weights become the model.
     #[serde(default)]
     pub keep: Keep,
+    /// The average of the weights over updates that is evaluated and becomes the model; the weights themselves when absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub averaging: Option<AveragingSpec>,
     /// The network, from input to output.
     pub layers: Vec<LayerSpec>,
     /// From camera image to network input.
     pub preprocessing: Preprocessing,
-    /// Which images of a row are used, with which labels.
+    /// Where labels come from.
+    #[serde(default, skip_serializing_if = "LabelSpec::is_default")]
+    pub labels: LabelSpec,
+    /// Which images of a row are used, and what that adds to the label.
     #[serde(default)]
     pub samples: SampleSpec,
     /// Thinning out of over-frequent labels.
@@ -206,6 +212,11 @@ impl Recipe {
         Ok(network)
     }
 
+    /// The labels of `recordings`.
+    pub fn targets(&self, recordings: &[Recording]) -> Targets {
+        Targets::of(recordings, &self.labels, &self.samples, &self.augmentation)
+    }
+
     fn check(&self) -> Result<(), String> {
         let allowed = |c: char| c.is_alphanumeric() || "-_.".contains(c);
         if self.name.is_empty() || self.name.starts_with('.') || !self.name.chars().all(allowed) {
@@ -243,8 +254,12 @@ impl Recipe {
             return Err(format!("loss.delta must be a positive number, not {delta}"));
         }
         self.optimizer.check().map_err(|message| format!("[optimizer] {message}"))?;
+        if let Some(averaging) = &self.averaging {
+            averaging.check().map_err(|message| format!("averaging: {message}"))?;
+        }
         self.schedule.check().map_err(|message| format!("[schedule] {message}"))?;
         self.preprocessing.validate().map_err(|e| e.to_string())?;
+        self.labels.validate().map_err(|e| e.to_string())?;
         self.samples.validate().map_err(|e| e.to_string())?;
         self.balance.validate().map_err(|e| e.to_string())?;
         self.augmentation.validate().map_err(|e| e.to_string())?;
@@ -361,6 +376,8 @@ mod tests {
         assert!(error(&["preprocessing.rows=[10, 200]"]).contains("rows"));
         assert!(error(&["preprocessing.resize=[4, 4]"]).contains("layer `pool1`"));
         assert!(error(&["keep=last", "early_stopping={patience_epochs=1}"]).contains("keeps the best epoch"));
+        assert!(error(&["averaging={kind='ema', decay=1}"]).contains("averaging: decay must lie in [0, 1)"));
+        assert!(error(&["averaging={kind='ema', decays=0.9}"]).contains("did you mean `decay`?"));
         assert!(error(&["name='../x'"]).contains("letters, digits"));
         assert!(error(&["early_stopping={patience_epochs=1}", "split.validation_share=0"]).contains("validation side"));
         assert!(error(&["layers=[{kind='dense', units=100000000000000}]"]).contains("units"));

@@ -6,7 +6,7 @@ use std::sync::{Mutex, PoisonError};
 use ndarray::{Array1, ArrayView1, ArrayView4, Axis};
 use steersman::engine::loss::Loss;
 use steersman::engine::network::{InferencePlan, LayerSpec, Network, Parameters, Predictor, StepInput, TrainingPlan};
-use steersman::engine::optimizer::Optimizer;
+use steersman::engine::optimizer::{AveragingSpec, Optimizer, WeightAverage};
 use steersman::engine::random::{Purpose, rng, uniform};
 use steersman::engine::tensor::Shape;
 use steersman::recipe::Recipe;
@@ -114,14 +114,14 @@ fn a_training_step_allocates_nothing() {
         let allocated = pool.install(|| {
             let (mut plan, mut optimizer) = (TrainingPlan::new(&setup.network, 37), setup.optimizer());
             let mut parameters = setup.network.initialize(1);
-            for _ in 0..3 {
+            let averaging = AveragingSpec::Ema { decay: 0.9, from_share: 0.0, refit_batches: 0 };
+            let mut average = WeightAverage::new(averaging, &parameters, setup.network.isa());
+            let mut step = || {
                 setup.step(&mut plan, &mut optimizer, &mut parameters);
-            }
-            allocations(|| {
-                for _ in 0..5 {
-                    setup.step(&mut plan, &mut optimizer, &mut parameters);
-                }
-            })
+                average.take_in(&parameters, optimizer.updates, 1000);
+            };
+            (0..3).for_each(|_| step());
+            allocations(|| (0..5).for_each(|_| step()))
         });
         assert_eq!(allocated, 0, "{recipe}");
     }
@@ -242,6 +242,24 @@ fn a_network_can_learn_eight_images_by_heart() {
 }
 
 /// Two networks of the same sizes, with another slope: all buffers would fit, so nothing but the plan itself can tell.
+/// With batch norm behind several layers (`hyper`), and none at all (`lenet`).
+#[test]
+fn a_pass_for_statistics_alone_moves_them_as_a_step_does_and_nothing_else() {
+    for (recipe, size) in [NETWORKS[0], NETWORKS[1]] {
+        let setup = Setup::new(recipe, size, 7);
+        let (mut by_step, mut by_pass) = (setup.network.initialize(1), setup.network.initialize(1));
+        let fresh = by_pass.clone();
+        for step in 0..2 {
+            let input = || StepInput { x: setup.images(), labels: ArrayView1::from(&setup.labels), seed: 1, step };
+            TrainingPlan::new(&setup.network, 9).step(&setup.network, &mut by_step, &setup.recipe.loss, input());
+            TrainingPlan::new(&setup.network, 9).pass_statistics(&setup.network, &mut by_pass, input());
+        }
+        assert_eq!(by_pass, by_step);
+        assert_eq!(by_pass.statistics != fresh.statistics, recipe == "hyper");
+        assert_eq!(by_pass.values, fresh.values);
+    }
+}
+
 #[test]
 #[should_panic(expected = "a training plan for another network")]
 fn a_training_plan_refuses_another_network_of_the_same_sizes() {

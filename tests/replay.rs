@@ -6,7 +6,7 @@ use std::path::Path;
 use std::sync::Mutex;
 
 use common::command::{error, json, run};
-use steersman::dataset;
+use steersman::dataset::{self, DrivenSessions};
 use steersman::geometry::{CarGeometry, LookAhead};
 use steersman::picture::RgbImage;
 use steersman::replay::{ReplayLog, ReplayOptions, ReplayRun, replay, side_camera_check, summarise};
@@ -93,8 +93,8 @@ fn path_labels_are_smoother_than_keys_and_mean_the_same_road() {
     record(scratch.path());
     let recording = dataset::load(&scratch.path().join("drive")).unwrap();
     let geometry = CarGeometry::preset("steersman").unwrap();
-    let log = ReplayLog::of_any_length(&recording, geometry.clone());
-    let labels = log.path_labels(LookAhead::usual(&geometry));
+    assert!(recording.camera_named && recording.geometry == geometry, "the recorder says what its camera is");
+    let labels = DrivenSessions::of(&recording, geometry.clone()).path_labels(LookAhead::usual(&geometry));
     let pairs: Vec<(f64, f64)> = (labels.iter().zip(&recording.rows))
         .filter_map(|(label, row)| Some((f64::from((*label)?), f64::from(row.steering))))
         .collect();
@@ -125,5 +125,18 @@ fn the_command_tells_writes_and_refuses() {
     assert!(said(&["drive", "expert", "--on", "drive"]).contains("name a model"));
     assert!(said(&["drive", "zero", "--on", "drive", "--camera", "tank"]).contains("udacity-straight"));
     assert!(said(&["drive", "zero", "--on", "nowhere"]).contains("nowhere"));
+
+    // What stands beside the log decides; without it a preset is assumed, and said so.
+    let ratio = |report: &serde_json::Value| report["warp"]["warped"].as_f64().unwrap();
+    let beside = dir.join("drive/steersman.toml");
+    std::fs::write(&beside, "[camera]\npreset = \"udacity\"\nside_offsets_m = [0.8, -0.8]\n").unwrap();
+    let (wrong, _) = told("1", "wrong");
+    assert!(ratio(&wrong) > 1.3 * ratio(&report), "side cameras that have changed places: {wrong}");
+    std::fs::write(&beside, "[camera]\nheight_m = 0.0\n").unwrap();
+    let told_off = said(&["drive", "zero", "--on", "drive"]);
+    assert!(told_off.contains("steersman.toml") && told_off.contains("height_m: must be 0.01 to 100 m"), "{told_off}");
+    std::fs::remove_file(&beside).unwrap();
+    let told = run(dir, &["drive", "zero", "--on", "drive"]).stderr;
+    assert!(String::from_utf8(told).unwrap().contains("`udacity` is assumed"));
     assert!(said(&["drive", "zero", "--on", "drive", "--latency-ms=-1"]).contains("latency"));
 }

@@ -78,6 +78,40 @@ fn a_killed_run_goes_on_to_the_same_bits() {
     assert_same_result(folder.path(), "killed", &whole);
 }
 
+/// An average whose running statistics are fitted anew, and one whose statistics are averaged.
+#[test]
+fn a_killed_run_goes_on_to_the_same_averaged_weights() {
+    let folder = tempfile::tempdir().unwrap();
+    painted_log::write(&folder.path().join("log"), 400, "");
+    let layers = "layers=[{kind='conv2d', filters=4, kernel=[3, 3], stride=[2, 2]}, {kind='batch_norm'}, {kind='relu'}, \
+                  {kind='flatten'}, {kind='dense', units=1}]";
+    let of = |averaging| [&ARGS[..], &["--set", layers, "--set", averaging]].concat();
+    let mut hashes = Vec::new();
+    for averaging in ["averaging={kind='ema', decay=0.99, refit_batches=5}", "averaging={kind='swa', from_share=0.3}"] {
+        let args = of(averaging);
+        let whole = json(folder.path(), &[&args[..], &["--out", "whole", "--threads", "1"]].concat());
+        let mut child = steersman(folder.path())
+            .args(&args)
+            .args(["--out", "killed"])
+            .stdout(Stdio::null())
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap();
+        wait_for_second_epoch(folder.path(), "killed");
+        child.kill().unwrap();
+        child.wait().unwrap();
+        assert!(!folder.path().join("killed/result.json").exists(), "it was finished before it could be killed");
+        assert_same_result(folder.path(), "killed", &whole);
+        hashes.push(whole["weights_hash"].to_string());
+        ["whole", "killed"].iter().for_each(|run| fs::remove_dir_all(folder.path().join(run)).unwrap());
+    }
+    let args = of("averaging={kind='ema', decay=0.99}");
+    hashes.push(json(folder.path(), &[&args[..], &["--out", "averaged"]].concat())["weights_hash"].to_string());
+    hashes.sort();
+    hashes.dedup();
+    assert_eq!(hashes.len(), 3, "the entries of the recipe make a difference");
+}
+
 #[test]
 fn a_run_by_im2col_goes_on_by_im2col() {
     let folder = tempfile::tempdir().unwrap();

@@ -196,3 +196,47 @@ fn figures_of_a_run_count_the_images_that_were_used() {
     assert!(events.iter().any(told), "{lost} lost: {events:?}");
     assert!(result.val_images < whole.val_images && result.val_images > 0, "{result:?}");
 }
+
+/// One update an epoch: the weights after each update are those of a shorter run.
+const ONE_UPDATE: [&str; 4] =
+    ["batch=1000", "keep=last", "optimizer.learning_rate=1e-3", "schedule.shape={kind='constant'}"];
+
+#[test]
+fn the_model_is_the_mean_of_the_weights_over_the_last_updates_and_is_what_is_validated() {
+    let folder = tempfile::tempdir().unwrap();
+    let after = |updates: usize| {
+        let epochs = format!("epochs={updates}");
+        train(folder.path(), &format!("plain-{updates}"), &[&ONE_UPDATE[..], &[&epochs]].concat());
+        weights(folder.path(), &format!("plain-{updates}"), "model.safetensors").values
+    };
+    let plain: Vec<Vec<f32>> = (1..=4).map(after).collect();
+    let ema = |k: i32| 0.5f64.powi(4 - k);
+    let averages: [(&str, &str, [f64; 4]); 2] = [
+        // Of four updates the first is left out: 0.25 · 4 = 1.
+        ("swa", "averaging={kind='swa', from_share=0.25}", [0.0, 1.0, 1.0, 1.0]),
+        ("ema", "averaging={kind='ema', decay=0.5}", [ema(1), ema(2), ema(3), ema(4)]),
+    ];
+    for (name, averaging, shares) in averages {
+        let (result, _) = train(folder.path(), name, &[&ONE_UPDATE[..], &["epochs=4", averaging]].concat());
+        let model = weights(folder.path(), name, "model.safetensors");
+        assert!(model == weights(folder.path(), name, "last.safetensors"));
+        for (k, value) in model.values.iter().enumerate() {
+            let sum: f64 = plain.iter().zip(shares).map(|(weights, share)| share * f64::from(weights[k])).sum();
+            let expected = sum / shares.iter().sum::<f64>();
+            assert!((f64::from(*value) - expected).abs() < 1e-6, "{name}, weight {k}: {value} is not {expected}");
+            assert!(name == "swa" || k > 0 || *value != plain[3][k], "the average is not the last weights");
+        }
+        // The same weights, validated by a run that does not change them.
+        let file = format!("{name}/model.safetensors");
+        let recording = Path::new(env!("CARGO_MANIFEST_DIR")).join("data/sample");
+        let recording = recording.to_str().unwrap();
+        let args = ["train", recording, "--from", &file, "--out", "again", "--seed", "5", "--json"];
+        let again = json(folder.path(), &[&args[..], &["--set", "epochs=1", "--set", AT_REST]].concat());
+        std::fs::remove_dir_all(folder.path().join("again")).unwrap();
+        approx::assert_relative_eq!(
+            again["val_mse"].as_f64().unwrap(),
+            result["val_mse"].as_f64().unwrap(),
+            max_relative = 1e-6
+        );
+    }
+}

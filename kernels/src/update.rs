@@ -79,6 +79,16 @@ per_isa! {
 }
 
 per_isa! {
+    /// `y += share * (x - y)`, element by element.
+    pub fn move_towards<S>(_simd: S, share: f32, y: &mut [f32], x: &[f32]) {
+        assert_eq!(y.len(), x.len(), "move_towards: y and x differ in length");
+        for (y, &x) in y.iter_mut().zip(x) {
+            *y += share * (x - *y);
+        }
+    }
+}
+
+per_isa! {
     /// `x *= a`.
     pub fn scale<S>(_simd: S, x: &mut [f32], a: f32) {
         for x in x {

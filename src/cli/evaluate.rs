@@ -11,12 +11,11 @@ use steersman_kernels::Isa;
 use super::recording_args::RecordingArgs;
 use super::{load_model, or_dash, pool, print_json};
 use crate::dataset::held_out::trained_on_held_out;
-use crate::dataset::{Recording, View};
+use crate::dataset::{DrivenSessions, Recording, View};
 use crate::error::{Error, Result};
-use crate::geometry::{GeometryEntry, LookAhead};
+use crate::geometry::LookAhead;
 use crate::metrics::{Metrics, Prediction};
 use crate::pilot::Pilot;
-use crate::replay::{ReplayLog, usual_preset};
 
 /// Compare a model's steering with what was recorded: centre camera, every usable row
 #[derive(Debug, Args)]
@@ -87,11 +86,11 @@ pub fn run(args: EvaluateArgs) -> Result<()> {
             eprintln!("{notice}");
         }
         known += (0..recording.rows.len()).filter(|row| trained_on.contains(&recording.row_id(*row))).count();
-        let geometry = GeometryEntry::default().resolve(usual_preset(&recording))?;
-        let look_ahead = LookAhead { seconds: args.look_ahead_s, ..LookAhead::usual(&geometry) };
-        let log = ReplayLog::of_any_length(&recording, geometry);
-        assumed_mps = assumed_mps.or(log.assumed_speed_mps);
-        let path_labels = log.path_labels(look_ahead);
+        recording.camera_notice().iter().for_each(|notice| eprintln!("{notice}"));
+        let look_ahead = LookAhead { seconds: args.look_ahead_s, ..LookAhead::usual(&recording.geometry) };
+        let driven = DrivenSessions::of(&recording, recording.geometry.clone());
+        assumed_mps = assumed_mps.or(driven.assumed_speed_mps);
+        let path_labels = driven.path_labels(look_ahead);
         for (row, prediction) in pool.install(|| predict(&pilot, &recording, sessions_before)) {
             predictions.push(prediction);
             path_predictions.extend(path_labels[row].map(|label| Prediction { label, ..prediction }));

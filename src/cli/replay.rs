@@ -17,7 +17,6 @@ use crate::observer::{StopSignal, Tally};
 use crate::picture::RgbImage;
 use crate::replay::{
     ReplayLog, ReplayOptions, ReplayRun, ReplaySummary, WarpCheck, moments_csv, replay, side_camera_check, summarise,
-    usual_preset,
 };
 
 /// What `drive` was asked for, as far as it concerns recordings.
@@ -67,8 +66,13 @@ pub fn run(args: &ReplayArgs) -> Result<()> {
     models.map(|name| model_file(Path::new(name))).collect::<Result<Vec<_>>>()?;
     let recording = pool.install(|| args.reading.load(args.on))?;
     recording.require_usable()?;
-    let entry = GeometryEntry { preset: args.camera.map(String::from), ..GeometryEntry::default() };
-    let geometry = entry.resolve(usual_preset(&recording))?;
+    let geometry = match args.camera {
+        Some(name) => GeometryEntry { preset: Some(name.into()), ..GeometryEntry::default() }.resolve(name)?,
+        None => {
+            recording.camera_notice().iter().for_each(|notice| eprintln!("{notice}"));
+            recording.geometry.clone()
+        }
+    };
     let log = ReplayLog::new(&recording, geometry)?;
     let options = ReplayOptions { latency_ms: args.latency_ms, ..ReplayOptions::usual(&log.geometry) };
     let folder = args.out.map(NewFolder::create).transpose()?;

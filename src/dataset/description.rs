@@ -10,6 +10,7 @@ use std::str::FromStr;
 use serde::{Deserialize, Serialize};
 
 use super::store::{Kind, Store};
+use crate::geometry::{CarGeometry, GeometryEntry};
 use crate::text::excerpt;
 use crate::{Error, Result};
 
@@ -30,6 +31,9 @@ pub(crate) const HZ: std::ops::RangeInclusive<f64> = 0.1..=1000.0;
 /// [columns]               # of a log with a header: number from 1, or name
 /// steering = 4
 /// center = "image"
+/// [camera]                # mount, lens and car: a preset, and what differs from it
+/// preset = "udacity"
+/// roll_deg = 0.0
 /// ```
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -49,6 +53,9 @@ pub struct Description {
     /// Whose commands are the labels.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub labels: Option<Labels>,
+    /// Camera and car.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub camera: Option<GeometryEntry>,
 }
 
 /// What a column of a log can hold.
@@ -245,7 +252,7 @@ impl Description {
 
     /// These entries, and those of `other` where there is none here.
     pub fn or(mut self, other: Description) -> Description {
-        let Description { columns, unit, full_lock_deg, hz, labels } = other;
+        let Description { columns, unit, full_lock_deg, hz, labels, camera } = other;
         for (column, reference) in columns {
             self.columns.entry(column).or_insert(reference);
         }
@@ -255,6 +262,7 @@ impl Description {
             full_lock_deg: self.full_lock_deg.or(full_lock_deg),
             hz: self.hz.or(hz),
             labels: self.labels.or(labels),
+            camera: self.camera.or(camera),
         }
     }
 
@@ -268,6 +276,9 @@ impl Description {
         }
         if self.full_lock_deg.is_some_and(|angle| !(1.0..=2000.0).contains(&angle)) {
             return Err("full_lock_deg: must be 1 to 2000".into());
+        }
+        if let Some(camera) = &self.camera {
+            camera.resolve(CarGeometry::USUAL).map_err(|error| error.to_string())?;
         }
         if self.columns.values().any(|reference| *reference == ColumnRef::Number(0)) {
             return Err("columns: they count from 1".into());
@@ -311,6 +322,10 @@ mod tests {
         for wrong in ["unit = 'furlongs'", "speed = 3", "hz = 'fast'"] {
             assert!(toml::from_str::<Description>(wrong).is_err(), "{wrong}");
         }
+        let mount: Description = toml::from_str("[camera]\npreset = 'udacity-straight'\nheight_m = 1.4").unwrap();
+        assert_eq!(mount.validate(), Ok(()));
+        let unknown: Description = toml::from_str("[camera]\npreset = 'tank'").unwrap();
+        assert!(unknown.validate().unwrap_err().contains("known are udacity"), "{:?}", unknown.validate());
         assert!(Description { hz: Some(0.0), ..Default::default() }.validate().is_err());
         for wrong in ["steering", "steering=", "wheel=3", "steering=0"] {
             assert!(parse_columns(wrong).is_err(), "{wrong}");

@@ -11,6 +11,7 @@
 //! recording for people.
 
 mod description;
+mod driven;
 mod formats;
 pub mod held_out;
 pub mod inspect;
@@ -23,12 +24,16 @@ mod store;
 mod unusable;
 
 pub use description::{Column, ColumnRef, DESCRIPTION_FILE, Description, Labels, Unit, parse_columns};
+pub use driven::{DrivenSession, DrivenSessions};
 pub use formats::{table as table_of_formats, udacity_writer};
 pub use load::{load, load_with, recordings_below};
 pub use pictures::{cache, colour, preprocess, resize};
 pub use recording::{Recording, Row, SESSION_GAP_MS, View};
 pub use rows::ImageCheck;
-pub use samples::{Balance, Flip, Group, Item, SampleSpec, augment, leak, loader, split};
+pub use samples::{
+    Balance, Correction, Flip, Group, Item, LabelKind, LabelSpec, Mirror, SampleSpec, Targets, augment, leak, loader,
+    split,
+};
 pub use unusable::{Reason, Tally, Unusable};
 
 #[cfg(test)]

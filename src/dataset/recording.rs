@@ -5,6 +5,7 @@ use super::pictures::files::{Files, Name};
 use super::pictures::preprocess::Preprocessing;
 use super::store::Store;
 use super::unusable::Unusable;
+use crate::geometry::CarGeometry;
 use crate::picture::RgbImage;
 use crate::picture::decode::decode_rgb;
 use crate::{Error, Result};
@@ -82,6 +83,10 @@ pub struct Recording {
     pub notices: Vec<String>,
     /// Height and width of the first image, if it was looked at.
     pub image_size: Option<[usize; 2]>,
+    /// Camera and car: as was said, or the preset for recordings of this kind.
+    pub geometry: CarGeometry,
+    /// Whether a preset was named.
+    pub camera_named: bool,
     /// Whether `time_ms` comes from the recording or the user; otherwise a rate is assumed.
     pub times_plausible: bool,
     /// Why the labels cannot be believed: they look like another unit than shares of full lock.
@@ -123,6 +128,18 @@ impl Recording {
     /// Name of the format.
     pub fn kind(&self) -> &'static str {
         self.format.id
+    }
+
+    /// What is to be said where the geometry of the recording matters: the preset that was assumed, if none was named.
+    pub fn camera_notice(&self) -> Option<String> {
+        (!self.camera_named).then(|| {
+            format!(
+                "{}: no preset for camera and car is named, `{}` is assumed: say preset = … under [camera] in steersman.toml \
+                 beside the log",
+                self.path.display(),
+                usual_preset(self.format.id)
+            )
+        })
     }
 
     /// Reads the centre picture of every row and keeps a hash of it, so that [`split`](super::split::split) knows copies.
@@ -309,6 +326,11 @@ impl Recording {
             }
         }
     }
+}
+
+/// The preset for recordings in the format `id` that say nothing of their camera.
+pub(super) fn usual_preset(id: &str) -> &'static str {
+    if id.contains("tub") { CarGeometry::USUAL_SMALL } else { CarGeometry::USUAL }
 }
 
 /// A hash of `bytes` that is the same in every version of this program.

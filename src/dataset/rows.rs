@@ -9,9 +9,10 @@ use std::sync::Arc;
 use super::description::{Description, Unit};
 use super::formats::Format;
 use super::pictures::files::{Files, Locator};
-use super::recording::{Recording, Row, View};
+use super::recording::{Recording, Row, View, usual_preset};
 use super::store::Store;
 use super::unusable::{Reason, Unusable};
+use crate::geometry::GeometryEntry;
 use crate::picture::decode;
 use crate::text::escaped;
 use crate::{Error, Result};
@@ -243,6 +244,7 @@ impl<'a> Rows<'a> {
         Ok(Collected {
             check: self.check,
             hz: self.said.hz,
+            camera: self.said.camera.clone(),
             assumed_hz: self.assumed_hz,
             rows: self.rows,
             files: self.files,
@@ -259,6 +261,7 @@ impl<'a> Rows<'a> {
 pub(crate) struct Collected {
     check: ImageCheck,
     hz: Option<f64>,
+    camera: Option<GeometryEntry>,
     assumed_hz: f64,
     rows: Vec<Row>,
     files: Files,
@@ -272,6 +275,8 @@ pub(crate) struct Collected {
 impl Collected {
     /// The recording at `path`, whose files lie in `store`.
     pub fn into_recording(self, path: &Path, store: Store, format: &'static Format) -> Result<Recording> {
+        let camera = self.camera.unwrap_or_default();
+        let geometry = camera.resolve(usual_preset(format.id))?;
         let notices = store.notice().into_iter().chain(self.notices).collect();
         let mut recording = Recording {
             path: path.into(),
@@ -281,6 +286,8 @@ impl Collected {
             unusable: self.unusable,
             notices,
             image_size: None,
+            geometry,
+            camera_named: camera.preset.is_some(),
             times_plausible: true,
             unit_trouble: self.unit_trouble,
             picture_hashes: Vec::new(),

@@ -3,6 +3,7 @@
 use super::pictures::files::Files;
 use super::recording::{Recording, Row, View};
 use super::unusable::Unusable;
+use crate::geometry::CarGeometry;
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -57,6 +58,8 @@ pub(crate) fn recording_of(steering: &[f32], step_ms: i64) -> Recording {
         unusable: Unusable::default(),
         notices: Vec::new(),
         image_size: None,
+        geometry: CarGeometry::preset(CarGeometry::USUAL).expect("a preset"),
+        camera_named: false,
         times_plausible: true,
         unit_trouble: None,
         picture_hashes: Vec::new(),

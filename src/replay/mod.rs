@@ -12,7 +12,7 @@ mod log;
 mod run;
 mod trust;
 
-pub use log::{Frames, ReplayLog, ReplaySession, usual_preset};
+pub use log::{Frames, ReplayLog};
 pub use run::{
     MAX_OFFSET_M, MAX_TURN_DEG, ReplayFrame, ReplayMoment, ReplayOptions, ReplayRun, ReplaySummary, moments_csv,
     replay, summarise,

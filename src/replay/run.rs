@@ -3,8 +3,8 @@
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::log::{Frames, ReplayLog, ReplaySession};
-use crate::dataset::View;
+use super::log::{Frames, ReplayLog};
+use crate::dataset::{DrivenSession, View};
 use crate::error::{Error, Result};
 use crate::geometry::{CarGeometry, LookAhead, Offset, PixelGrid, ViewWarp};
 use crate::picture::RgbImage;
@@ -71,7 +71,7 @@ pub struct ReplayFrame<'a> {
     /// The warped picture, as the driver saw it.
     pub view: &'a RgbImage,
     /// The session that is driven.
-    pub session: &'a ReplaySession,
+    pub session: &'a DrivenSession,
     /// Where the car is, and how it is steered.
     pub moment: ReplayMoment,
 }
@@ -157,7 +157,7 @@ where
 
 fn drive_session(
     log: &ReplayLog,
-    session: &ReplaySession,
+    session: &DrivenSession,
     options: &ReplayOptions,
     mut driver: impl FnMut(&RgbImage) -> Result<f32>,
     seen: &dyn Fn(&ReplayFrame) -> Result<()>,
@@ -221,7 +221,7 @@ fn drive_session(
 }
 
 /// The row, within the session, that was recorded nearest to `at_m`.
-fn nearest_row(session: &ReplaySession, at_m: f64) -> usize {
+fn nearest_row(session: &DrivenSession, at_m: f64) -> usize {
     let before = session.path.row_at(at_m);
     let after = (before + 1).min(session.path.len() - 1);
     if session.path.along_m(after) - at_m < at_m - session.path.along_m(before) { after } else { before }
@@ -236,7 +236,7 @@ struct Eye {
 
 impl Eye {
     /// The view of a car at `offset` from where it was at `row` of the session: made of the picture of the nearest camera.
-    fn look(&mut self, log: &ReplayLog, session: &ReplaySession, row: usize, offset: Offset) -> Result<&RgbImage> {
+    fn look(&mut self, log: &ReplayLog, session: &DrivenSession, row: usize, offset: Offset) -> Result<&RgbImage> {
         let row = session.rows.start + row;
         let [left_m, right_m] = log.geometry.side_offsets_m;
         let (camera, taken_m) = [(View::Centre, 0.0), (View::Left, left_m), (View::Right, right_m)]

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::history::EpochRecord;
 use crate::engine::network::{Network, Parameters};
-use crate::engine::optimizer::{Optimizer, Plateau};
+use crate::engine::optimizer::{Optimizer, Plateau, WeightAverage};
 use crate::error::{Error, Result};
 use crate::model_file::{self, StoredTensor};
 
@@ -14,6 +14,7 @@ const FORMAT: u32 = 1;
 const OPTIMIZER_FIRST: &str = "optimizer.first";
 const OPTIMIZER_SECOND: &str = "optimizer.second";
 const BEST: &str = "best.";
+const AVERAGE: &str = "average.";
 
 /// Everything that changes during a run.
 #[derive(Clone, Debug)]
@@ -22,7 +23,9 @@ pub(super) struct State {
     pub parameters: Parameters,
     /// Number of updates and moving averages.
     pub optimizer: Optimizer,
-    /// The weights of the best epoch so far.
+    /// The average of the weights, if the recipe asks for one.
+    pub average: Option<WeightAverage>,
+    /// The weights of the best epoch so far, or their average.
     pub best: Option<Parameters>,
     /// Counters and measures.
     pub progress: Progress,
@@ -66,10 +69,21 @@ struct Metadata {
     format: u32,
     updates: u64,
     has_best: bool,
+    /// Updates that are in the average; absent if none is taken.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    averaged_updates: Option<u64>,
     progress: Progress,
 }
 
 impl State {
+    /// The parameters that are evaluated and saved: the average, once it has begun.
+    pub fn model(&self) -> &Parameters {
+        match &self.average {
+            Some(average) if average.updates > 0 => &average.parameters,
+            _ => &self.parameters,
+        }
+    }
+
     /// Writes the state, in whole or not at all.
     ///
     /// # Errors
@@ -80,6 +94,7 @@ impl State {
             format: FORMAT,
             updates: self.optimizer.updates,
             has_best: self.best.is_some(),
+            averaged_updates: self.average.as_ref().map(|average| average.updates),
             progress: self.progress.clone(),
         };
         let metadata = serde_json::to_string(&metadata).map_err(|e| Error::data(path, e.to_string()))?;
@@ -87,18 +102,26 @@ impl State {
         for (name, values) in [(OPTIMIZER_FIRST, &self.optimizer.first), (OPTIMIZER_SECOND, &self.optimizer.second)] {
             tensors.push(StoredTensor::vector(name, values));
         }
-        for tensor in self.best.iter().flat_map(|best| model_file::tensors_of(network, best)) {
-            tensors.push(StoredTensor { name: format!("{BEST}{}", tensor.name), ..tensor });
+        let average = self.average.as_ref().filter(|average| average.updates > 0).map(|average| &average.parameters);
+        for (prefix, parameters) in [(BEST, self.best.as_ref()), (AVERAGE, average)] {
+            for tensor in parameters.iter().flat_map(|parameters| model_file::tensors_of(network, parameters)) {
+                tensors.push(StoredTensor { name: format!("{prefix}{}", tensor.name), ..tensor });
+            }
         }
         model_file::write_tensors(path, &tensors, metadata)
     }
 
-    /// Reads a state for `network`; `optimizer` is a fresh one and takes over what is stored.
+    /// Reads a state for `network`; `optimizer` and `average` are fresh ones and take over what is stored.
     ///
     /// # Errors
     ///
     /// [`Error::Io`] and [`Error::Data`].
-    pub fn load(path: &Path, network: &Network, mut optimizer: Optimizer) -> Result<State> {
+    pub fn load(
+        path: &Path,
+        network: &Network,
+        mut optimizer: Optimizer,
+        mut average: Option<WeightAverage>,
+    ) -> Result<State> {
         let bytes = model_file::read_file(path)?;
         let (tensors, metadata) = model_file::read_tensors(path, &bytes)?;
         let metadata: Metadata =
@@ -110,19 +133,28 @@ impl State {
             *values = model_file::find_f32(path, &tensors, name, &[values.len()])?;
         }
         optimizer.updates = metadata.updates;
+        if average.is_some() != metadata.averaged_updates.is_some() {
+            return Err(Error::data(path, "does not belong to the recipe beside it: one of them averages the weights"));
+        }
+        if let (Some(average), Some(updates)) = (&mut average, metadata.averaged_updates) {
+            average.updates = updates;
+            if updates > 0 {
+                average.parameters = model_file::read_parameters(path, network, &tensors, AVERAGE)?;
+            }
+        }
         let best = match metadata.has_best {
             true => Some(model_file::read_parameters(path, network, &tensors, BEST)?),
             false => None,
         };
         let parameters = model_file::read_parameters(path, network, &tensors, "")?;
-        Ok(State { parameters, optimizer, best, progress: metadata.progress })
+        Ok(State { parameters, optimizer, average, best, progress: metadata.progress })
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::engine::optimizer::OptimizerSpec;
+    use crate::engine::optimizer::{AveragingSpec, OptimizerSpec};
     use crate::recipe::Recipe;
     use steersman_kernels::Isa;
 
@@ -130,8 +162,11 @@ mod tests {
     fn a_state_comes_back_as_it_was() {
         let network = Recipe::find("lenet", &[]).unwrap().network(Isa::PORTABLE).unwrap();
         let spec = OptimizerSpec::Sgd { learning_rate: 0.1, momentum: 0.9, l2: 0.0, decoupled_weight_decay: 0.0 };
+        let averaging = AveragingSpec::Ema { decay: 0.9, from_share: 0.0, refit_batches: 0 };
+        let average = |of: u64| Some(WeightAverage::new(averaging, &network.initialize(of), network.isa()));
         let mut state = State {
             parameters: network.initialize(1),
+            average: average(3),
             optimizer: Optimizer::new(spec, None, network.tensors(), network.isa()),
             best: Some(network.initialize(2)),
             progress: Progress { epoch: 3, loss_sum: 0.1 + 0.2, best_val_mse: Some(1.0 / 3.0), ..Progress::default() },
@@ -140,8 +175,16 @@ mod tests {
         state.optimizer.first[5] = 0.25;
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("checkpoint.safetensors");
+        let fresh = || Optimizer::new(spec, None, network.tensors(), network.isa());
+        // An average that has not begun has no weights.
         state.save(&path, &network).unwrap();
-        let read = State::load(&path, &network, Optimizer::new(spec, None, network.tensors(), network.isa())).unwrap();
+        let read = State::load(&path, &network, fresh(), average(1)).unwrap();
+        assert_eq!((read.average.as_ref().unwrap().updates, read.model()), (0, &state.parameters));
+        state.average.as_mut().unwrap().updates = 5;
+        state.save(&path, &network).unwrap();
+        let read = State::load(&path, &network, fresh(), average(1)).unwrap();
+        assert_eq!((read.average.as_ref().unwrap().updates, read.model()), (5, &network.initialize(3)));
+        assert!(State::load(&path, &network, fresh(), None).unwrap_err().to_string().contains("averages the weights"));
         assert_eq!(read.parameters, state.parameters);
         assert_eq!(read.best, state.best);
         assert_eq!(read.progress, state.progress);

@@ -15,6 +15,7 @@
 //! | `report.html` | the run in pictures; see [`crate::report::pages::run`] |
 //! | `result.json` | what `train --json` prints; its presence says that the run is finished |
 
+mod averaged;
 mod checkpoint;
 mod data;
 mod history;

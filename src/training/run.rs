@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 use steersman_kernels::conv::ConvAlgorithm;
 use steersman_kernels::{Backend, Isa};
 
+use super::averaged;
 use super::checkpoint::{Progress, State};
 use super::data::{Data, images};
 use super::history::EpochRecord;
@@ -19,7 +20,7 @@ use crate::dataset::Description;
 use crate::dataset::held_out::held_out_tracks;
 use crate::dataset::loader::{Batch, Loader};
 use crate::engine::network::{Network, Parameters, StepInput, TrainingPlan};
-use crate::engine::optimizer::Optimizer;
+use crate::engine::optimizer::{Optimizer, WeightAverage};
 use crate::engine::stopwatch::Stopwatch;
 use crate::error::{Error, Result};
 use crate::files::atomic_file;
@@ -312,7 +313,13 @@ impl TrainingRun {
         Ok(TrainingRun {
             plan: TrainingPlan::new(&network, capacity),
             validation: validation.map(|loader| Validation::new(loader, &network, capacity, recipe.full_lock_deg)),
-            state: State { parameters, optimizer, best: None, progress: Progress::default() },
+            state: State {
+                average: recipe.averaging.map(|spec| WeightAverage::new(spec, &parameters, network.isa())),
+                parameters,
+                optimizer,
+                best: None,
+                progress: Progress::default(),
+            },
             folder,
             _lock: lock,
             info,
@@ -344,7 +351,8 @@ impl TrainingRun {
     fn restore(&mut self) -> Result<()> {
         let path = self.folder.file("checkpoint.safetensors");
         if path.is_file() {
-            self.state = State::load(&path, &self.network, self.state.optimizer.clone())?;
+            let (optimizer, average) = (self.state.optimizer.clone(), self.state.average.clone());
+            self.state = State::load(&path, &self.network, optimizer, average)?;
         }
         Ok(())
     }
@@ -368,8 +376,15 @@ impl TrainingRun {
                     message: format!("no training image can be decoded: {examples}"),
                 });
             }
+            averaged::refit_statistics(
+                &mut self.state,
+                (&self.network, &mut self.plan),
+                &self.training,
+                &mut batches,
+                self.info.seed,
+            )?;
             let validation = match &mut self.validation {
-                Some(validation) => validation.run(&self.network, &self.state.parameters)?,
+                Some(validation) => validation.run(&self.network, self.state.model())?,
                 None => None,
             };
             if validation.is_some_and(|v| !v.mse.is_finite()) {
@@ -410,7 +425,7 @@ impl TrainingRun {
             let batch = self.state.progress.next_batch;
             let (training, following) = (&self.training, batch + 1);
             let step = u64::from(epoch) * batches as u64 + batch as u64;
-            let State { parameters, optimizer, progress, .. } = &mut self.state;
+            let State { parameters, optimizer, average, progress, .. } = &mut self.state;
             let (network, plan, loss) = (&self.network, &mut self.plan, &self.recipe.loss);
             // The next batch is loaded while the network trains on this one.
             let ((mean_loss, step_done), filled) = rayon::join(
@@ -434,6 +449,9 @@ impl TrainingRun {
                 let fraction = self.recipe.schedule.fraction(optimizer.updates, updates_in_all, &progress.plateau);
                 progress.learning_rate = self.recipe.optimizer.learning_rate() * fraction;
                 optimizer.step(progress.learning_rate, &mut parameters.values, plan.gradient_mut(), norm);
+                if let Some(average) = average {
+                    average.take_in(parameters, optimizer.updates, updates_in_all);
+                }
             }
             progress.loss_sum += mean_loss * current.n as f64;
             progress.images += current.n;
@@ -481,7 +499,7 @@ impl TrainingRun {
     }
 
     fn end_epoch(&mut self, validation: Option<ValidationResult>, started: Instant) -> EpochRecord {
-        let State { parameters, best, progress, .. } = &mut self.state;
+        let progress = &mut self.state.progress;
         let record = EpochRecord {
             epoch: progress.epoch + 1,
             train_loss: progress.loss_sum / progress.images.max(1) as f64,
@@ -506,8 +524,11 @@ impl TrainingRun {
         if better {
             progress.best_val_mse = record.val_mse;
             progress.best_epoch = record.epoch;
-            best.get_or_insert_with(|| parameters.clone()).clone_from(parameters);
+            let mut best = self.state.best.take().unwrap_or_else(|| self.state.parameters.clone());
+            best.clone_from(self.state.model());
+            self.state.best = Some(best);
         }
+        let progress = &mut self.state.progress;
         if let Some(now) = record.val_mse {
             self.recipe.schedule.end_epoch(now, &mut progress.plateau);
             let min_delta = self.recipe.early_stopping.map_or(0.0, |stopping| stopping.min_delta);
@@ -568,7 +589,7 @@ impl TrainingRun {
             self.model(best, progress.best_epoch).save(&folder.model())?;
             // In the middle of an epoch the weights have no measures of their own; only the checkpoint stores them.
             if progress.next_batch == 0 {
-                self.model(&self.state.parameters, epoch).save(&folder.file("last.safetensors"))?;
+                self.model(self.state.model(), epoch).save(&folder.file("last.safetensors"))?;
             }
         }
         Ok(())
@@ -616,6 +637,9 @@ impl TrainingRun {
             && let Some(best) = &self.state.best
         {
             self.state.parameters.clone_from(best);
+            if let Some(average) = &mut self.state.average {
+                average.updates = 0;
+            }
             epoch_of_weights = self.state.progress.best_epoch;
         }
         let progress = &self.state.progress;
@@ -639,7 +663,7 @@ impl TrainingRun {
             seconds: progress.seconds,
             images_per_second: images as f64 / seconds,
             algorithm: self.info.algorithm.clone(),
-            weights_hash: weights_hash(&self.network, &self.state.parameters),
+            weights_hash: weights_hash(&self.network, self.state.model()),
             leak_percent: self.leak_percent,
             near_twin_percent: self.validation.as_ref().map(|v| 100.0 * v.near_twins(&self.training).share()),
             trained_on_held_out: self.info.trained_on_held_out.clone(),

@@ -241,6 +241,11 @@ fn updates_agree_with_the_loops() {
             let x = numbers(1, len);
             let expected: Vec<f32> = x.iter().zip(&grads).map(|(x, g)| x + g).collect();
             failures.compare(&format!("sum_into {what}"), &sum, &expected, 0.0);
+            let mut moved = x.clone();
+            update::move_towards(isa, 0.3, &mut moved, &grads);
+            let expected: Vec<f32> =
+                x.iter().zip(&grads).map(|(x, g)| (0.7 * f64::from(*x) + 0.3 * f64::from(*g)) as f32).collect();
+            failures.compare(&format!("move_towards {what}"), &moved, &expected, 1e-6);
             let expected: Vec<f32> = x.iter().map(|x| x * -3.0).collect();
             failures.compare(&format!("scale {what}"), &scaled, &expected, 0.0);
             let expected: f64 = x.iter().map(|&x| f64::from(x).powi(2)).sum();

@@ -203,6 +203,37 @@ impl TrainingPlan {
     /// code), if `parameters` are not those of such a network, or if the batch is empty, larger than planned, of the wrong shape
     /// or not in standard order.
     pub fn step(&mut self, network: &Network, parameters: &mut Parameters, loss: &Loss, input: StepInput) -> f64 {
+        let (input, used) = self.begin_step(network, parameters, input);
+        if self.segments.len() == 1 {
+            self.step_without_barriers(network, parameters, loss, input, used);
+        } else {
+            self.forward_with_barriers(network, parameters, Some(loss), input, used);
+            self.backward_with_barriers(network, parameters, input, used);
+        }
+        self.reduce_gradient(network, used);
+        self.shards[..used].iter().map(|shard| shard.loss).sum::<f64>() / input.labels.len() as f64
+    }
+
+    /// Lets the running statistics go on over one batch as [`step`](TrainingPlan::step) does, and changes nothing else: the forward
+    /// pass alone, as far as the last batch normalisation. Without any it does nothing.
+    ///
+    /// # Panics
+    ///
+    /// As [`step`](TrainingPlan::step).
+    pub fn pass_statistics(&mut self, network: &Network, parameters: &mut Parameters, input: StepInput) {
+        if self.segments.len() > 1 {
+            let (input, used) = self.begin_step(network, parameters, input);
+            self.forward_with_barriers(network, parameters, None, input, used);
+        }
+    }
+
+    /// Cuts the batch into shards and packs the weights; returns the batch and the number of its shards.
+    fn begin_step<'a>(
+        &mut self,
+        network: &Network,
+        parameters: &Parameters,
+        input: StepInput<'a>,
+    ) -> (StepSlices<'a>, usize) {
         assert_eq!(self.fingerprint, network.fingerprint(), "a training plan for another network");
         network.check_parameters(parameters);
         let input = input.slices(network);
@@ -216,13 +247,7 @@ impl TrainingPlan {
         }
         self.freeze_moments(network, parameters);
         self.pack(network, parameters);
-        if self.segments.len() == 1 {
-            self.step_without_barriers(network, parameters, loss, input, used);
-        } else {
-            self.step_with_barriers(network, parameters, loss, input, used);
-        }
-        self.reduce_gradient(network, used);
-        self.shards[..used].iter().map(|shard| shard.loss).sum::<f64>() / input.labels.len() as f64
+        (input, used)
     }
 
     /// Packs the weights once for all shards.
@@ -285,11 +310,12 @@ impl TrainingPlan {
         });
     }
 
-    fn step_with_barriers(
+    /// Without a loss it ends at the last barrier.
+    fn forward_with_barriers(
         &mut self,
         network: &Network,
         parameters: &mut Parameters,
-        loss: &Loss,
+        loss: Option<&Loss>,
         input: StepSlices,
         used: usize,
     ) {
@@ -310,12 +336,9 @@ impl TrainingPlan {
         let first_learning = *first_learning;
         let shards = &mut shards[..used];
         let images = shards.last().map_or(0, |shard| shard.images.end);
-        let barrier = |stage: usize| {
-            stages[stage].barrier(network).expect("segments begin with a stage that has batch statistics")
-        };
-        let last = segments.len() - 1;
-
-        for (index, segment) in segments.iter().enumerate() {
+        let barrier = |stage: usize| barrier_of(stages, network, stage);
+        let wanted = segments.len() - usize::from(loss.is_none());
+        for (index, segment) in segments[..wanted].iter().enumerate() {
             let run =
                 StepContext { network, parameters, stages, packed, moments, moments_of, first_learning, input, times };
             let next_barrier = segments.get(index + 1).map(|next| next.start);
@@ -330,7 +353,7 @@ impl TrainingPlan {
                         run.forward_sums(stage, barrier(stage), shard, images);
                     }
                 }
-                if next_barrier.is_none() {
+                if let Some(loss) = loss.filter(|_| next_barrier.is_none()) {
                     run.loss(loss, shard, shard.images.clone());
                 }
                 spare_scratch.put(std::mem::take(&mut shard.scratch));
@@ -347,6 +370,28 @@ impl TrainingPlan {
                 );
             }
         }
+    }
+
+    fn backward_with_barriers(&mut self, network: &Network, parameters: &Parameters, input: StepSlices, used: usize) {
+        let TrainingPlan {
+            shards,
+            spare_scratch,
+            stages,
+            packed,
+            moments,
+            moments_of,
+            sums,
+            segments,
+            segment_groups,
+            first_learning,
+            times,
+            ..
+        } = self;
+        let first_learning = *first_learning;
+        let shards = &mut shards[..used];
+        let images = shards.last().map_or(0, |shard| shard.images.end);
+        let barrier = |stage: usize| barrier_of(stages, network, stage);
+        let last = segments.len() - 1;
         for (index, segment) in segments.iter().enumerate().rev() {
             let run =
                 StepContext { network, parameters, stages, packed, moments, moments_of, first_learning, input, times };
@@ -401,6 +446,11 @@ impl TrainingPlan {
             },
         );
     }
+}
+
+/// The barrier of `stage`, with which a segment begins.
+fn barrier_of<'a>(stages: &'a [FusedStage], network: &'a Network, stage: usize) -> &'a dyn BatchStatistics {
+    stages[stage].barrier(network).expect("segments begin with a stage that has batch statistics")
 }
 
 /// The size of a group in `segment`; `None` if the shard must go through it as a whole, because the backward pass moves a gradient

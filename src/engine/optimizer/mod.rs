@@ -1,4 +1,4 @@
-//! Optimizers, weight decay in its three meanings, gradient clipping and learning-rate schedules.
+//! Optimizers, weight decay in its three meanings, gradient clipping, learning-rate schedules and averages of the weights.
 //!
 //! | name | what it does | also known as |
 //! |---|---|---|
@@ -8,10 +8,12 @@
 //!
 //! The first two apply to the weights of convolutions and dense layers only, never to biases, slopes or batch norm.
 
+mod averaging;
 mod schedule;
 
 use std::ops::Range;
 
+pub use averaging::{AveragingSpec, WeightAverage};
 use rayon::prelude::*;
 pub use schedule::{Plateau, Schedule, ScheduleSpec};
 use serde::{Deserialize, Serialize};

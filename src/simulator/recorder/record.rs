@@ -5,6 +5,7 @@ use std::path::Path;
 
 use rayon::prelude::*;
 
+use crate::dataset::DESCRIPTION_FILE;
 use crate::files::new_folder::NewFolder;
 use crate::observer::{Observer, Progress, Tally};
 use crate::simulator::recorder::expert_drive::drive_expert;
@@ -15,7 +16,8 @@ use crate::simulator::scenery::light::Variant;
 use crate::simulator::track::Track;
 use crate::{Error, Result};
 
-/// Records a drive of the expert into the new folder `out`: `driving_log.csv`, `IMG/` and `recording.toml`.
+/// Records a drive of the expert into the new folder `out`: `driving_log.csv`, `IMG/`, `recording.toml` and `steersman.toml`, which
+/// names the camera.
 ///
 /// Pictures are taken on all threads; the files do not depend on their number.
 ///
@@ -76,6 +78,8 @@ fn fill(
     let mut text = lines.header().as_bytes().to_vec();
     let rows = samples.iter().try_for_each(|sample| lines.row(sample, &mut text));
     rows.and_then(|()| fs::write(&log, text)).map_err(Error::io(&log))?;
+    let description = folder.unfinished().join(DESCRIPTION_FILE);
+    fs::write(&description, "[camera]\npreset = \"steersman\"\n").map_err(Error::io(&description))?;
     let info = RecordingInfo::new(track, options, samples.len());
     info.write(folder.unfinished())?;
     Ok(info)
