@@ -80,7 +80,7 @@ fn checksum_fits(header: &[u8; BLOCK as usize]) -> bool {
 /// A number in octal digits, or in binary where the first bit is set.
 fn number(field: &[u8]) -> Option<u64> {
     if field[0] & 0x80 != 0 {
-        let digits = field[1..].iter();
+        let mut digits = field[1..].iter();
         return digits.try_fold(u64::from(field[0] & 0x7f), |number, &digit| {
             number.checked_mul(256)?.checked_add(u64::from(digit))
         });
