@@ -4,6 +4,7 @@ pub mod augment;
 mod balance;
 pub mod leak;
 pub mod loader;
+mod pairs;
 mod spec;
 pub mod split;
 
