@@ -15,7 +15,7 @@ use steersman_kernels::{Backend, Isa};
 use crate::dataset::augment::Augmentation;
 use crate::dataset::preprocess::Preprocessing;
 use crate::dataset::split::SplitSpec;
-use crate::dataset::{Balance, Group, SampleSpec};
+use crate::dataset::{Balance, Group, LabelSpec, Recording, SampleSpec, Targets};
 use crate::engine::loss::{Loss, Smoothness};
 use crate::engine::network::{LayerSpec, Network};
 use crate::engine::optimizer::{AveragingSpec, OptimizerSpec, Schedule, ScheduleSpec};
@@ -67,7 +67,10 @@ pub struct Recipe {
     pub layers: Vec<LayerSpec>,
     /// From camera image to network input.
     pub preprocessing: Preprocessing,
-    /// Which images of a row are used, with which labels.
+    /// Where labels come from.
+    #[serde(default, skip_serializing_if = "LabelSpec::is_default")]
+    pub labels: LabelSpec,
+    /// Which images of a row are used, and what that adds to the label.
     #[serde(default)]
     pub samples: SampleSpec,
     /// Thinning out of over-frequent labels.
@@ -193,6 +196,11 @@ impl Recipe {
         Ok(network)
     }
 
+    /// The labels of `recordings`.
+    pub fn targets(&self, recordings: &[Recording]) -> Targets {
+        Targets::of(recordings, &self.labels, &self.samples, &self.augmentation)
+    }
+
     fn check(&self) -> Result<(), String> {
         let allowed = |c: char| c.is_alphanumeric() || "-_.".contains(c);
         if self.name.is_empty() || self.name.starts_with('.') || !self.name.chars().all(allowed) {
@@ -244,6 +252,7 @@ impl Recipe {
         }
         self.schedule.check().map_err(|message| format!("[schedule] {message}"))?;
         self.preprocessing.validate().map_err(|e| e.to_string())?;
+        self.labels.validate().map_err(|e| e.to_string())?;
         self.samples.validate().map_err(|e| e.to_string())?;
         self.balance.validate().map_err(|e| e.to_string())?;
         self.augmentation.validate().map_err(|e| e.to_string())?;

@@ -542,7 +542,7 @@ fn nothing_but_files_within_the_recording_is_opened() {
 #[test]
 fn rows_with_one_picture_never_stand_on_both_sides() {
     use steersman::dataset::split::{SplitSpec, split};
-    use steersman::dataset::{Balance, SampleSpec};
+    use steersman::dataset::{Balance, SampleSpec, Targets};
     let folder = tempfile::tempdir().unwrap();
     let first = write(&plain(), &folder.path().join("a"));
     let second = write(&plain(), &folder.path().join("b"));
@@ -562,8 +562,8 @@ fn rows_with_one_picture_never_stand_on_both_sides() {
             .collect();
         recordings.iter_mut().for_each(Recording::hash_pictures);
         for seed in 0..10 {
-            let split =
-                split(&recordings, &SplitSpec::default(), &SampleSpec::default(), &Balance::default(), seed).unwrap();
+            let (spec, samples, targets) = (SplitSpec::default(), SampleSpec::default(), Targets::wheel(&recordings));
+            let split = split(&recordings, &targets, &spec, &samples, &Balance::default(), seed).unwrap();
             let hashes = |side: &[dataset::Item]| -> Vec<u64> {
                 side.iter()
                     .map(|item| recordings[usize::from(item.recording)].picture_hash(item.row as usize).unwrap())

@@ -30,7 +30,10 @@ pub use load::{load, load_with, recordings_below};
 pub use pictures::{cache, colour, preprocess, resize};
 pub use recording::{Recording, Row, SESSION_GAP_MS, View};
 pub use rows::ImageCheck;
-pub use samples::{Balance, Flip, Group, Item, SampleSpec, augment, leak, loader, split};
+pub use samples::{
+    Balance, Correction, Flip, Group, Item, LabelKind, LabelSpec, Mirror, SampleSpec, Targets, augment, leak, loader,
+    split,
+};
 pub use unusable::{Reason, Tally, Unusable};
 
 #[cfg(test)]

@@ -32,6 +32,8 @@ pub enum Purpose {
     Simulate = 8,
     /// Tests and benchmarks.
     Test = 9,
+    /// Where beside the driven path an image is shown from; the stream is the sample.
+    View = 10,
 }
 
 /// Opens the random stream of `purpose` in `epoch` for `stream` (a sample, a parameter, a layer).

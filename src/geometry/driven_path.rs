@@ -170,14 +170,10 @@ impl DrivenPath {
     }
 
     /// The steering that leads a car at `pose` to the point of the path `ahead_m` past `along_m`; `None` if the path ends before.
-    /// It may lie beyond [-1, 1].
-    ///
-    /// The circle through the rear axle, tangent to the car, that meets a point `right` aside at the distance `l` has the curvature
-    /// `2 right / l²`.
+    /// It may lie beyond [-1, 1]. See [`CarGeometry::steering_towards`].
     pub fn pursuit(&self, geometry: &CarGeometry, pose: Pose, along_m: f64, ahead_m: f64) -> Option<f64> {
         let to = pose.offset_to(self.pose_at(along_m + ahead_m)?);
-        let square = (to.right_m * to.right_m + to.ahead_m * to.ahead_m).max(0.25 * ahead_m * ahead_m);
-        Some(geometry.steering_for(2.0 * to.right_m / square))
+        Some(geometry.steering_towards(to.right_m, to.ahead_m, ahead_m))
     }
 
     /// The path label of `row`: pursuit of the path from the row's own pose. `None` near the end of the session.

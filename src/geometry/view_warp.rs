@@ -67,9 +67,31 @@ impl ViewWarp {
 
     /// As [`new`](Self::new), to a camera `wanted_m` to the right of the displaced car's centre camera.
     pub fn between(geometry: &CarGeometry, grid: PixelGrid, taken_m: f64, offset: Offset, wanted_m: f64) -> ViewWarp {
-        // Coordinates are right, up, ahead. Rays of the wanted camera in its car's axes:
+        ViewWarp::planned(geometry, grid, taken_m, offset, wanted_m, false)
+    }
+
+    /// As [`new`](Self::new), in a world that is mirrored, left and right: the car stands at the mirror image of `offset`, and its
+    /// camera is mounted as ever. A picture of a rolled or turned camera that is mirrored column by column would show the horizon as
+    /// no camera of the car sees it.
+    pub fn mirrored(geometry: &CarGeometry, grid: PixelGrid, taken_m: f64, offset: Offset) -> ViewWarp {
+        ViewWarp::planned(geometry, grid, taken_m, offset, 0.0, true)
+    }
+
+    fn planned(
+        geometry: &CarGeometry,
+        grid: PixelGrid,
+        taken_m: f64,
+        offset: Offset,
+        wanted_m: f64,
+        mirrored: bool,
+    ) -> ViewWarp {
+        // Coordinates are right, up, ahead. Rays of the wanted camera in its car's axes, mirrored back into the world that the picture
+        // was taken in:
         let mount = rotation(geometry);
-        let rays = mount * lens(geometry).inverse_of_lens() * grid.picture_to_camera();
+        let side = if mirrored { -1.0 } else { 1.0 };
+        let wanted_m = side * wanted_m;
+        let mirror = Matrix([[side, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]);
+        let rays = mirror * mount * lens(geometry).inverse_of_lens() * grid.picture_to_camera();
         // A turn to the right by t takes the displaced car's (right, ahead) into the first car's.
         let (sin, cos) = (libm::sin(offset.turn), libm::cos(offset.turn));
         let turn = Matrix([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]]);
@@ -111,38 +133,70 @@ impl ViewWarp {
     pub fn apply(&self, from: &[u8], to: &mut [u8]) {
         let [h, w] = self.size;
         assert!(from.len() == h * w * 3 && to.len() == h * w * 3, "pictures of {w}x{h} pixels");
+        if h < 2 || w < 2 {
+            return self.apply_thin(from, to);
+        }
         for (row, line) in to.chunks_exact_mut(w * 3).enumerate() {
             let y = row as f64 + 0.5;
-            // Along a row everything is linear in the column.
+            // Along a row everything is linear in the column, so the horizon is crossed once at most.
             let rise = [self.rise[0], self.rise[1] * y + self.rise[2]];
-            let ends = [&self.ground, &self.far].map(|m| m.0.map(|[a, b, c]| [a, b * y + c]));
-            for (column, pixel) in line.chunks_exact_mut(3).enumerate() {
-                let x = column as f64 + 0.5;
-                let below = rise[0] * x + rise[1] < 0.0;
-                let [u, v, weight] = ends[usize::from(!below)].map(|[a, b]| a * x + b);
-                let scale = if weight > 1e-9 { 1.0 / weight } else { 0.0 };
-                let sample = bilinear(from, self.size, (u * scale) as f32, (v * scale) as f32);
-                pixel.copy_from_slice(&sample);
-            }
+            let is_below = |column: usize| rise[0] * (column as f64 + 0.5) + rise[1] < 0.0;
+            let first = is_below(0);
+            let crossing = if first == is_below(w - 1) { w } else { ((-rise[1] / rise[0]) as usize).min(w) };
+            // The division may be a column off.
+            let crossing = (crossing.saturating_sub(1)..w).find(|&column| is_below(column) != first).unwrap_or(w);
+            let (left, right) = line.split_at_mut(crossing * 3);
+            let [at_left, at_right] = if first { [&self.ground, &self.far] } else { [&self.far, &self.ground] };
+            span(from, self.size, &at_left.along_row(y), 0, left);
+            span(from, self.size, &at_right.along_row(y), crossing, right);
+        }
+    }
+
+    /// A picture of a single row or column: nothing lies between pixels.
+    fn apply_thin(&self, from: &[u8], to: &mut [u8]) {
+        let [h, w] = self.size;
+        for (i, pixel) in to.chunks_exact_mut(3).enumerate() {
+            let (x, y) = self.source((i % w) as f64 + 0.5, (i / w) as f64 + 0.5).unwrap_or((0.0, 0.0));
+            let (x, y) = ((x as usize).min(w - 1), (y as usize).min(h - 1));
+            pixel.copy_from_slice(&from[(y * w + x) * 3..(y * w + x) * 3 + 3]);
         }
     }
 }
 
-/// The colour at (column, row) of a picture, pixel centres at halves.
-fn bilinear(picture: &[u8], [h, w]: [usize; 2], column: f32, row: f32) -> [u8; 3] {
-    let place = |at: f32, n: usize| {
-        let at = (at - 0.5).clamp(0.0, (n - 1) as f32);
-        let first = (at as usize).min(n - 1);
-        (first, (first + 1).min(n - 1), ((at - first as f32) * 256.0) as u32)
-    };
-    let ((x0, x1, fx), (y0, y1, fy)) = (place(column, w), place(row, h));
-    let at = |y: usize, x: usize| &picture[(y * w + x) * 3..(y * w + x) * 3 + 3];
-    let (a, b, c, d) = (at(y0, x0), at(y0, x1), at(y1, x0), at(y1, x1));
-    std::array::from_fn(|i| {
-        let top = u32::from(a[i]) * (256 - fx) + u32::from(b[i]) * fx;
-        let bottom = u32::from(c[i]) * (256 - fx) + u32::from(d[i]) * fx;
-        ((top * (256 - fy) + bottom * fy + (1 << 15)) >> 16) as u8
-    })
+/// Pixels whose sources are found together, so that the compiler can use vectors.
+const CHUNK: usize = 64;
+
+/// Fills `line`, the pixels of a row from column `start` on, from `from`. `ends` holds, for the source's column, its row and
+/// their weight, the factor of the column and the constant. Pixel centres lie at halves.
+fn span(from: &[u8], [h, w]: [usize; 2], ends: &[[f32; 2]; 3], start: usize, line: &mut [u8]) {
+    let [u, v, weight] = ends;
+    let (last_x, last_y) = ((w - 1) as f32, (h - 1) as f32);
+    // The last pixel is that to the right of, or below, the one before.
+    let (max_x, max_y) = (w as i32 - 2, h as i32 - 2);
+    let (mut at, mut right, mut down) = ([0u32; CHUNK], [0u32; CHUNK], [0u32; CHUNK]);
+    let mut begin = start;
+    for part in line.chunks_mut(CHUNK * 3) {
+        for i in 0..CHUNK {
+            let x = (begin + i) as f32 + 0.5;
+            let scale = (weight[0] * x + weight[1]).max(1e-9);
+            let column = ((u[0] * x + u[1]) / scale - 0.5).max(0.0).min(last_x);
+            let row = ((v[0] * x + v[1]) / scale - 0.5).max(0.0).min(last_y);
+            let (column, row) = ((column * 256.0) as i32, (row * 256.0) as i32);
+            let (x0, y0) = ((column >> 8).min(max_x), (row >> 8).min(max_y));
+            at[i] = (y0 * w as i32 + x0) as u32 * 3;
+            (right[i], down[i]) = ((column - (x0 << 8)) as u32, (row - (y0 << 8)) as u32);
+        }
+        for (i, pixel) in part.as_chunks_mut::<3>().0.iter_mut().enumerate() {
+            let (at, fx, fy) = (at[i] as usize, right[i], down[i]);
+            let (upper, lower) = (&from[at..at + 6], &from[at + w * 3..at + w * 3 + 6]);
+            *pixel = std::array::from_fn(|c| {
+                let upper = u32::from(upper[c]) * (256 - fx) + u32::from(upper[c + 3]) * fx;
+                let lower = u32::from(lower[c]) * (256 - fx) + u32::from(lower[c + 3]) * fx;
+                ((upper * (256 - fy) + lower * fy + (1 << 15)) >> 16) as u8
+            });
+        }
+        begin += CHUNK;
+    }
 }
 
 /// From camera axes (right, up, along the optical axis) to the car's (right, up, ahead): roll, then pitch, then yaw.
@@ -170,6 +224,11 @@ struct Matrix([[f64; 3]; 3]);
 impl Matrix {
     fn times(&self, v: [f64; 3]) -> [f64; 3] {
         self.0.map(|[a, b, c]| a * v[0] + b * v[1] + c * v[2])
+    }
+
+    /// The product with (x, `y`, 1): the factor of x and the constant of each entry.
+    fn along_row(&self, y: f64) -> [[f32; 2]; 3] {
+        self.0.map(|[a, b, c]| [a as f32, (b * y + c) as f32])
     }
 
     fn transposed(self) -> Matrix {
@@ -284,5 +343,68 @@ mod tests {
             assert!((x * 2.0 - whole_x).abs() < 1e-9 && (y * 2.0 + 56.0 - whole_y).abs() < 1e-9);
         }
         assert!(large.sees_ground(160.0, 120.0) && !large.sees_ground(160.0, 20.0));
+    }
+
+    #[test]
+    fn pixels_are_interpolated_where_their_source_lies() {
+        let linear = |x: f64, y: f64| 10.0 + 0.5 * x + 0.3 * y;
+        let picture: Vec<u8> = (0..160 * 320)
+            .flat_map(|i| [linear((i % 320) as f64 + 0.5, (i / 320) as f64 + 0.5).round() as u8; 3])
+            .collect();
+        let mut warped = vec![0; picture.len()];
+        for offset in
+            [Offset { right_m: 0.7, ahead_m: 0.0, turn: 0.1 }, Offset { right_m: -0.4, ahead_m: 0.9, turn: -0.12 }]
+        {
+            for warp in [
+                ViewWarp::new(&udacity(), whole(), 0.825, offset),
+                ViewWarp::mirrored(&udacity(), whole(), -0.806, offset),
+            ] {
+                warp.apply(&picture, &mut warped);
+                for (i, pixel) in warped.as_chunks::<3>().0.iter().enumerate() {
+                    let (x, y) = warp.source((i % 320) as f64 + 0.5, (i / 320) as f64 + 0.5).unwrap();
+                    let grey = linear(x.clamp(0.5, 319.5), y.clamp(0.5, 159.5));
+                    let near = pixel.iter().all(|&found| (f64::from(found) - grey).abs() < 1.3);
+                    assert!(near, "{offset:?}, {} {}: {pixel:?} {grey}", i % 320, i / 320);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn thin_pictures_are_warped_too() {
+        for size in [[1, 1], [1, 7], [9, 1]] {
+            let grid = PixelGrid::whole(&udacity(), size);
+            let picture: Vec<u8> = (0..size[0] * size[1] * 3).map(|i| i as u8).collect();
+            let mut same = vec![255; picture.len()];
+            ViewWarp::new(&udacity(), grid, 0.0, Offset::default()).apply(&picture, &mut same);
+            assert_eq!(picture, same, "{size:?}");
+        }
+    }
+
+    #[test]
+    fn a_mirrored_world_is_seen_by_the_camera_as_it_is_mounted() {
+        // A car at `offset`, whose picture a side camera of a car on the path takes. In the mirrored world the same ground point has
+        // the opposite sign, and so has the car's place.
+        for (taken_m, offset) in [
+            (0.0, Offset::default()),
+            (-0.806, Offset { right_m: -0.9, ahead_m: 0.0, turn: 0.08 }),
+            (0.825, Offset { right_m: 0.5, ahead_m: 0.3, turn: -0.1 }),
+        ] {
+            let warp = ViewWarp::mirrored(&udacity(), whole(), taken_m, offset);
+            for (right_m, ahead_m) in [(0.0, 9.0), (-2.0, 14.0), (3.0, 30.0)] {
+                let (x, z) = (right_m - offset.right_m, ahead_m - offset.ahead_m);
+                let (sin, cos) = offset.turn.sin_cos();
+                let (x, z) = (x * cos - z * sin, x * sin + z * cos);
+                let (column, row) = pixel_of(-x, z, 0.0);
+                let (found_column, found_row) = warp.source(column, row).unwrap();
+                let (true_column, true_row) = pixel_of(right_m, ahead_m, taken_m);
+                assert!((found_column - true_column).abs() < 1e-6, "{found_column} {true_column}");
+                assert!((found_row - true_row).abs() < 1e-6, "{found_row} {true_row}");
+            }
+        }
+        // Column by column, the horizon of a rolled camera would tilt the other way: by 2 * 1.2 degrees, 13 rows across the picture.
+        let warp = ViewWarp::mirrored(&udacity(), whole(), 0.0, Offset::default());
+        let [left, right] = [0.5, 319.5].map(|column| warp.source(column, 60.0).unwrap().1 - 60.0);
+        assert!((left - right).abs() > 12.0, "{left} {right}");
     }
 }

@@ -10,7 +10,7 @@ use crate::dataset::cache::{CacheSpec, Overflow};
 use crate::dataset::leak::LeakAudit;
 use crate::dataset::loader::{Batch, Loader, LoaderSpec};
 use crate::dataset::split::{Split, split};
-use crate::dataset::{self, Description, ImageCheck, Item, Recording, View};
+use crate::dataset::{self, Description, ImageCheck, Item, Recording, Targets, View};
 use crate::engine::tensor::Shape;
 use crate::error::{Error, Result};
 use crate::files::atomic_file;
@@ -25,6 +25,7 @@ pub(super) fn images(input: Shape, batch: &Batch) -> ArrayView4<'_, f32> {
 #[derive(Debug)]
 pub(crate) struct Data {
     recordings: Arc<[Recording]>,
+    targets: Arc<Targets>,
     split: Split,
     leak: LeakAudit,
     loader: LoaderSpec,
@@ -53,7 +54,9 @@ impl Data {
             notices.extend(recording.notices_for(&recipe.preprocessing));
             recordings.push(recording);
         }
-        let split = split(&recordings, &recipe.split, &recipe.samples, &recipe.balance, seed)?;
+        let targets = recipe.targets(&recordings);
+        notices.extend_from_slice(targets.notices());
+        let split = split(&recordings, &targets, &recipe.split, &recipe.samples, &recipe.balance, seed)?;
         notices.push(split.summary());
         let leak = LeakAudit::of(&split, &recordings);
         notices.push(leak.summary());
@@ -69,7 +72,7 @@ impl Data {
                 folder: None,
             },
         };
-        Ok(Data { recordings: recordings.into(), split, leak, loader, notices })
+        Ok(Data { recordings: recordings.into(), targets: targets.into(), split, leak, loader, notices })
     }
 
     /// Messages for the user about the recordings and the split.
@@ -108,9 +111,10 @@ impl Data {
         (ids.iter().filter(|id| rows.binary_search(id).is_ok()).count(), ids.len())
     }
 
-    /// A hash over the rows of both sides, in hexadecimal digits.
+    /// A hash over the rows of both sides, and the geometry that their labels go by, in hexadecimal digits.
     pub fn rows_hash(&self) -> String {
         let mut hash = Sha256::new();
+        hash.update(self.targets.geometry_text());
         for side in [&self.split.training, &self.split.validation] {
             hash.update((side.len() as u64).to_le_bytes());
             for item in side {
@@ -164,7 +168,7 @@ impl Data {
     ///
     /// [`Error::Io`] if the cache file cannot be created.
     pub fn into_loaders(self) -> Result<(Loader, Option<Loader>)> {
-        let (training, validation) = Loader::pair(&self.recordings, &self.split, &self.loader)?;
+        let (training, validation) = Loader::pair(&self.recordings, &self.targets, &self.split, &self.loader)?;
         Ok((training, (validation.images() > 0).then_some(validation)))
     }
 

@@ -1,19 +1,54 @@
-//! Random changes to training images: a horizontal shift, shadows, lines, colours, brightness. Validation and driving never see
-//! them.
+//! Random changes to training images: another place beside the path, a horizontal shift, shadows, lines, colours, brightness.
+//! Validation and driving never see them.
 //!
-//! They act on the RGB stage of preprocessing (cropped, before the colour conversion), in this order: shift, shadows,
+//! They act on the RGB stage of preprocessing (cropped, before the colour conversion), in this order: view, shift, shadows,
 //! lines, colours, brightness. Each is drawn anew for every sample and epoch.
 
+use super::spec::Correction;
 use crate::dataset::pictures::preprocess::Preprocessing;
 use crate::engine::random::{below, uniform, unit};
+use crate::geometry::Offset;
 use crate::{Error, Result};
 use rand::Rng;
 use serde::{Deserialize, Serialize};
+
+/// The entry `view` of `[augmentation]`: the picture is warped to what a car beside the driven path would see, and the label is the
+/// steering that leads it back (Bojarski et al. 2016, PilotNet).
+///
+/// It is made of the nearest of the cameras that `samples.side_cameras` lets in.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ViewSpec {
+    /// Largest distance from the path to either side, m.
+    pub offset_m: f64,
+    /// Largest turn from the path to either side, deg.
+    pub turn_deg: f64,
+    /// Share of the samples that are warped; the others stay as they were taken.
+    #[serde(default = "always")]
+    pub probability: f64,
+}
+
+fn always() -> f64 {
+    1.0
+}
+
+impl ViewSpec {
+    /// Draws where the car stands; `None` for a sample that stays as it was taken.
+    pub fn draw(&self, rng: &mut impl Rng) -> Option<Offset> {
+        let chance = unit(rng);
+        let right_m = uniform(rng, -self.offset_m, self.offset_m);
+        let turn = uniform(rng, -self.turn_deg, self.turn_deg).to_radians();
+        (chance < self.probability).then_some(Offset { right_m, ahead_m: 0.0, turn })
+    }
+}
 
 /// The `[augmentation]` table of a recipe; everything is off by default.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Augmentation {
+    /// Views from beside the driven path.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub view: Option<ViewSpec>,
     /// Range of the factor that all grey levels are multiplied by (clamped at 255).
     #[serde(skip_serializing_if = "Option::is_none")]
     pub brightness: Option<[f64; 2]>,
@@ -31,9 +66,10 @@ pub struct Augmentation {
     /// Largest shift to the left or right, in source pixels. The edge column fills what comes into view.
     pub shift_px: f64,
     /// Steering added for each source pixel that the picture moves to the right: the road seems to lie to the right,
-    /// so the car has to steer there. Needed with `shift_px`; 0.002 to 0.003 is usual.
+    /// so the car has to steer there. Needed with `shift_px`; 0.002 to 0.003 is usual. Or `"geometry"`: the shift counts as a turn
+    /// of the camera.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub shift_steering_per_px: Option<f64>,
+    pub shift_steering_per_px: Option<Correction>,
     /// Largest turn of the hue either way, in degrees: a turn about the axis of grays.
     pub hue_deg: f64,
     /// Range of the factor of the distance from gray: 0 leaves a gray picture.
@@ -50,6 +86,7 @@ pub struct Augmentation {
 impl Default for Augmentation {
     fn default() -> Self {
         Self {
+            view: None,
             brightness: None,
             shadow_probability: 0.0,
             band_probability: 0.0,
@@ -69,7 +106,8 @@ impl Default for Augmentation {
 impl Augmentation {
     /// Whether anything is changed at all.
     pub fn is_active(&self) -> bool {
-        self.brightness.is_some()
+        self.view.is_some()
+            || self.brightness.is_some()
             || self.band_probability > 0.0
             || self.shadow_probability > 0.0
             || self.shift_px > 0.0
@@ -114,22 +152,34 @@ impl Augmentation {
         if !(0.0..=1000.0).contains(&self.shift_px) {
             return wrong("shift_px", "must be 0 to 1000 source pixels");
         }
-        if self.shift_px > 0.0 && !self.shift_steering_per_px.is_some_and(f64::is_finite) {
-            return wrong("shift_steering_per_px", "must be given with shift_px, for example 0.002");
+        if self.shift_px > 0.0 && !self.shift_steering_per_px.is_some_and(|by| by.fixed().is_finite()) {
+            return wrong("shift_steering_per_px", "must be given with shift_px, for example 0.002, or \"geometry\"");
+        }
+        if let Some(view) = self.view {
+            if !(0.0..=5.0).contains(&view.offset_m) {
+                return wrong("view.offset_m", "must be 0 to 5 m");
+            }
+            if !(0.0..=45.0).contains(&view.turn_deg) {
+                return wrong("view.turn_deg", "must be 0 to 45 degrees");
+            }
+            if !(0.0..=1.0).contains(&view.probability) {
+                return wrong("view.probability", "must be 0 to 1");
+            }
         }
         Ok(())
     }
 
-    /// Changes `rgb` (`[h][w][3]`, the RGB stage of `preprocessing`) and returns what is added to the steering.
-    pub fn apply(&self, preprocessing: &Preprocessing, rgb: &mut [u8], rng: &mut impl Rng) -> f32 {
+    /// Changes `rgb` (`[h][w][3]`, the RGB stage of `preprocessing`), all but the view, and returns by how many source pixels the
+    /// picture moved to the right.
+    pub fn apply(&self, preprocessing: &Preprocessing, rgb: &mut [u8], rng: &mut impl Rng) -> f64 {
         let [_, width] = preprocessing.rgb_size();
-        let mut steering = 0.0;
-        if let Some(per_px) = self.shift_steering_per_px.filter(|_| self.shift_px > 0.0) {
+        let mut moved_px = 0.0;
+        if self.shift_px > 0.0 {
             // Whole pixels of the stage, so that picture and label agree exactly.
             let source_px = preprocessing.source_px_per_rgb_px();
             let columns = (uniform(rng, -self.shift_px, self.shift_px) / source_px).round();
             shift(rgb, width, columns as isize);
-            steering = (columns * source_px * per_px) as f32;
+            moved_px = columns * source_px;
         }
         if self.shadow_probability > 0.0 {
             // All numbers are drawn in any case, so that one setting does not disturb the numbers of the next.
@@ -170,7 +220,7 @@ impl Augmentation {
             let table = factors(uniform(rng, low, high));
             rgb.iter_mut().for_each(|grey| *grey = table[usize::from(*grey)]);
         }
-        steering
+        moved_px
     }
 }
 
@@ -292,15 +342,15 @@ mod tests {
     }
 
     #[test]
-    fn the_label_moves_with_the_picture() {
-        let augmentation = Augmentation { shift_px: 6.0, shift_steering_per_px: Some(0.01), ..Default::default() };
+    fn pictures_move_by_as_much_as_is_said() {
+        let augmentation = Augmentation { shift_px: 6.0, ..Default::default() };
         let mut seen = std::collections::BTreeSet::new();
         for stream in 0..200 {
             let mut rgb = columns();
-            let steering = augmentation.apply(&preprocessing(), &mut rgb, &mut rng(1, Purpose::Test, 0, stream));
+            let moved_px = augmentation.apply(&preprocessing(), &mut rgb, &mut rng(1, Purpose::Test, 0, stream));
             // One column of the stage is two source pixels. Column 5 shows what was `moved` columns to its left.
-            let moved = (steering / 0.02).round() as i32;
-            assert!((steering - moved as f32 * 0.02).abs() < 1e-6 && moved.abs() <= 3);
+            let moved = (moved_px / 2.0) as i32;
+            assert!(moved_px == f64::from(moved) * 2.0 && moved.abs() <= 3);
             assert_eq!(i32::from(rgb[15]), 50 - 10 * moved);
             assert_eq!(i32::from(rgb[0]), (-10 * moved).max(0));
             assert_eq!(i32::from(rgb[27]), (90 - 10 * moved).min(90));
@@ -406,7 +456,30 @@ mod tests {
     }
 
     #[test]
+    fn views_are_drawn_within_their_bounds_and_as_often_as_is_said() {
+        let view: ViewSpec = toml::from_str("offset_m = 1.0\nturn_deg = 6.0\nprobability = 0.25").unwrap();
+        let drawn: Vec<Offset> =
+            (0..4000).filter_map(|stream| view.draw(&mut rng(3, Purpose::View, 0, stream))).collect();
+        assert!((900..1100).contains(&drawn.len()), "{}", drawn.len());
+        assert!(drawn.iter().all(|o| o.right_m.abs() <= 1.0 && o.turn.abs() <= 6f64.to_radians() && o.ahead_m == 0.0));
+        let reaches = |of: fn(&Offset) -> f64| drawn.iter().map(of).fold(0.0, f64::max);
+        assert!(reaches(|o| o.right_m) > 0.98 && reaches(|o| -o.turn) > 0.1);
+        let always: ViewSpec = toml::from_str("offset_m = 1.0\nturn_deg = 6.0").unwrap();
+        assert!((0..100).all(|stream| always.draw(&mut rng(3, Purpose::View, 0, stream)).is_some()));
+    }
+
+    #[test]
     fn tables_are_checked() {
+        for (wrong, key) in [
+            ("offset_m = 6, turn_deg = 1", "view.offset_m"),
+            ("offset_m = 1, turn_deg = nan", "view.turn_deg"),
+            ("offset_m = 1, turn_deg = 1, probability = 2", "view.probability"),
+        ] {
+            let table: Augmentation = toml::from_str(&format!("view = {{ {wrong} }}")).unwrap();
+            let error = table.validate().unwrap_err().to_string();
+            assert!(table.is_active() && error.contains(key), "{error}");
+        }
+        assert!(toml::from_str::<Augmentation>("view = { offset_m = 1 }").is_err());
         assert!(!Augmentation::default().is_active() && Augmentation::default().validate().is_ok());
         let shift: Augmentation = toml::from_str("shift_px = 50").unwrap();
         assert!(shift.is_active() && shift.validate().unwrap_err().to_string().contains("shift_steering_per_px"));

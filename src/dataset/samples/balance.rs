@@ -1,7 +1,7 @@
 //! Fewer rows of the steering values that are too common: the `[balance]` table of a recipe.
 
+use super::labels::Targets;
 use super::spec::Item;
-use crate::dataset::recording::Recording;
 use crate::engine::random::{Purpose, rng, shuffle};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
@@ -42,17 +42,17 @@ impl Balance {
         Ok(())
     }
 
-    /// Leaves out items; returns how many.
-    pub(super) fn apply(&self, items: &mut Vec<Item>, recordings: &[Recording], seed: u64) -> usize {
+    /// Leaves out items, which have labels; returns how many.
+    pub(super) fn apply(&self, items: &mut Vec<Item>, targets: &Targets, seed: u64) -> usize {
         let before = items.len();
         if let Some(share) = self.keep_zero {
-            let zeros: Vec<u32> = positions(items, |item| item.steering(recordings) == 0.0);
+            let zeros: Vec<u32> = positions(items, |item| targets.label(*item) == Some(0.0));
             let kept = (share * zeros.len() as f64).round() as usize;
             thin_out(items, zeros, kept, seed, 0);
         }
         if let (Some(bins), Some(most)) = (self.histogram_bins, self.histogram_max) {
             let bin_of = |item: &Item| {
-                let share = (f64::from(item.steering(recordings)) + 1.0) / 2.0;
+                let share = (f64::from(targets.label(*item).unwrap_or(0.0)) + 1.0) / 2.0;
                 ((share * bins as f64) as usize).min(bins - 1)
             };
             for bin in 0..bins {
@@ -94,16 +94,16 @@ mod tests {
     #[test]
     fn zeros_are_thinned_to_the_share_asked_for() {
         let steering: Vec<f32> = (0..1000).map(|i| if i % 2 == 0 { 0.0 } else { 0.3 }).collect();
-        let recordings = [recording_of(&steering, 100)];
+        let targets = Targets::wheel(&[recording_of(&steering, 100)]);
         let all: Vec<Item> = (0..1000).map(|row| Item::new(0, row, [View::Centre])).collect();
         let balance = Balance { keep_zero: Some(0.4), ..Default::default() };
         let run = |seed| {
             let mut items = all.clone();
-            assert_eq!(balance.apply(&mut items, &recordings, seed), 300);
+            assert_eq!(balance.apply(&mut items, &targets, seed), 300);
             items
         };
         let items = run(1);
-        let zeros = items.iter().filter(|item| item.steering(&recordings) == 0.0).count();
+        let zeros = items.iter().filter(|item| targets.label(**item) == Some(0.0)).count();
         assert_eq!((items.len(), zeros), (700, 200));
         assert!(items.is_sorted());
         assert_eq!(items, run(1));
@@ -113,16 +113,13 @@ mod tests {
     #[test]
     fn no_bin_holds_more_than_its_most() {
         let steering: Vec<f32> = (0..1000).map(|i| (i as f32 / 1000.0).powi(3)).collect();
-        let recordings = [recording_of(&steering, 100)];
+        let targets = Targets::wheel(&[recording_of(&steering, 100)]);
         let mut items: Vec<Item> = (0..1000).map(|row| Item::new(0, row, [View::Centre])).collect();
-        Balance { histogram_bins: Some(20), histogram_max: Some(50), ..Default::default() }.apply(
-            &mut items,
-            &recordings,
-            3,
-        );
+        Balance { histogram_bins: Some(20), histogram_max: Some(50), ..Default::default() }
+            .apply(&mut items, &targets, 3);
         let mut counts = [0; 20];
         for item in &items {
-            counts[((item.steering(&recordings) + 1.0) * 10.0) as usize] += 1;
+            counts[((targets.label(*item).unwrap() + 1.0) * 10.0) as usize] += 1;
         }
         assert!(counts.iter().all(|&n| n <= 50) && counts[10] == 50, "{counts:?}");
     }

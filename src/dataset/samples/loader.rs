@@ -8,7 +8,7 @@ use super::augment::Augmentation;
 use super::leak::{NearTwins, Thumbnail};
 use super::pairs::{Pairing, Wanted};
 use super::split::Split;
-use super::{Flip, Group, Item, SampleSpec};
+use super::{Flip, Group, Item, Mirror, SampleSpec, Targets};
 use crate::dataset::pictures::cache::{CacheSpec, ImageCache};
 use crate::dataset::pictures::preprocess::{Preprocessing, Preprocessor};
 use crate::dataset::recording::{Recording, View};
@@ -20,6 +20,8 @@ use crate::{Error, Result};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+
+mod sample;
 
 /// Everything that decides what batches look like.
 #[derive(Debug, Clone, PartialEq)]
@@ -72,6 +74,7 @@ pub struct Batch {
 #[derive(Debug)]
 pub struct Loader {
     recordings: Arc<[Recording]>,
+    targets: Arc<Targets>,
     spec: LoaderSpec,
     /// Only the training side shuffles, mirrors at random and augments.
     training: bool,
@@ -115,23 +118,31 @@ struct Scratch {
 }
 
 impl Loader {
-    /// Loaders of both sides of `split`; they share the memory budget in proportion to what they hold.
+    /// Loaders of both sides of `split`, whose labels are `targets`; they share the memory budget in proportion to what they hold.
     ///
     /// # Errors
     /// If a table of `spec` is wrong, or if the cache file cannot be created.
-    pub fn pair(recordings: &Arc<[Recording]>, split: &Split, spec: &LoaderSpec) -> Result<(Loader, Loader)> {
-        let bytes = |training: bool, items: &[Item]| {
+    pub fn pair(
+        recordings: &Arc<[Recording]>,
+        targets: &Arc<Targets>,
+        split: &Split,
+        spec: &LoaderSpec,
+    ) -> Result<(Loader, Loader)> {
+        let bytes = |training: bool, flip: Flip, items: &[Item]| {
             let images: usize = items.iter().map(|item| item.cameras().count()).sum();
-            images * cached_len(spec, training)
+            images * cached_len(spec, training, flip)
         };
-        let (training, validation) = (bytes(true, &split.training), bytes(false, &split.validation));
+        let (training, validation) = (
+            bytes(true, spec.samples.flip, &split.training),
+            bytes(false, validation_flip(&spec.samples), &split.validation),
+        );
         let share = training as f64 / (training + validation).max(1) as f64;
         let for_training = ((spec.cache.memory_bytes as f64 * share) as usize).min(spec.cache.memory_bytes);
         let with =
             |memory_bytes| LoaderSpec { cache: CacheSpec { memory_bytes, ..spec.cache.clone() }, ..spec.clone() };
         Ok((
-            Loader::training(recordings, split, &with(for_training))?,
-            Loader::validation(recordings, split, &with(spec.cache.memory_bytes - for_training))?,
+            Loader::training(recordings, targets, split, &with(for_training))?,
+            Loader::validation(recordings, targets, split, &with(spec.cache.memory_bytes - for_training))?,
         ))
     }
 
@@ -139,21 +150,31 @@ impl Loader {
     ///
     /// # Errors
     /// As [`Loader::pair`].
-    pub fn training(recordings: &Arc<[Recording]>, split: &Split, spec: &LoaderSpec) -> Result<Loader> {
-        Self::new(recordings, &split.training, spec, true, spec.samples.flip)
+    pub fn training(
+        recordings: &Arc<[Recording]>,
+        targets: &Arc<Targets>,
+        split: &Split,
+        spec: &LoaderSpec,
+    ) -> Result<Loader> {
+        Self::new(recordings, targets, &split.training, spec, true, spec.samples.flip)
     }
 
     /// The validation side: in the order of the log, never augmented.
     ///
     /// # Errors
     /// As [`Loader::pair`].
-    pub fn validation(recordings: &Arc<[Recording]>, split: &Split, spec: &LoaderSpec) -> Result<Loader> {
-        let flip = if spec.samples.validation_flips { Flip::Both } else { Flip::None };
-        Self::new(recordings, &split.validation, spec, false, flip)
+    pub fn validation(
+        recordings: &Arc<[Recording]>,
+        targets: &Arc<Targets>,
+        split: &Split,
+        spec: &LoaderSpec,
+    ) -> Result<Loader> {
+        Self::new(recordings, targets, &split.validation, spec, false, validation_flip(&spec.samples))
     }
 
     fn new(
         recordings: &Arc<[Recording]>,
+        targets: &Arc<Targets>,
         items: &[Item],
         spec: &LoaderSpec,
         training: bool,
@@ -173,9 +194,10 @@ impl Loader {
         }
         let mut loader = Loader {
             recordings: Arc::clone(recordings),
+            targets: Arc::clone(targets),
             training,
             flip,
-            cache: ImageCache::new(images.len(), cached_len(spec, training), &spec.cache)?,
+            cache: ImageCache::new(images.len(), cached_len(spec, training, flip), &spec.cache)?,
             thumbnails: items.iter().map(|_| OnceLock::new()).collect(),
             items: items.to_vec(),
             images,
@@ -320,42 +342,6 @@ impl Loader {
         }
     }
 
-    /// Writes a sample's network input to `x` and returns its label; `None` if the image cannot be decoded.
-    fn make_sample(&self, wanted: &Wanted, x: &mut [f32], scratch: &mut Scratch) -> Result<Option<f32>> {
-        let image = wanted.sample / self.variants() as u32;
-        let Scratch { file, image: decoded, preprocessor, cached, rgb, planes } = scratch;
-        let made = self.cache.get(image as usize, cached, |out| {
-            self.decode(image, file, decoded, preprocessor, out).map_err(|message| self.report(image, message)).is_ok()
-        })?;
-        let Some(made) = made else { return Ok(None) };
-        let preprocessing = &self.spec.preprocessing;
-        let (item, camera) = self.images[image as usize];
-        let mut label = self.spec.samples.label(self.items[item as usize].steering(&self.recordings), camera);
-        let augmented = keeps_rgb(&self.spec, self.training);
-        if augmented {
-            label += self.times.augment.time(|| {
-                rgb.copy_from_slice(made);
-                // The second augmentation of a sample has numbers that no first one has.
-                let stream = u64::from(wanted.draws) + if wanted.again { self.samples() as u64 } else { 0 };
-                let mut rng = rng(self.spec.seed, Purpose::Augment, self.epoch, stream);
-                self.spec.augmentation.apply(preprocessing, rgb, &mut rng)
-            });
-        }
-        self.times.preprocess.time(|| {
-            if augmented {
-                preprocessor.finish(rgb, planes);
-            } else {
-                planes.copy_from_slice(made);
-            }
-            if self.is_mirrored(wanted.draws) {
-                planes.chunks_exact_mut(preprocessing.resize[1]).for_each(<[u8]>::reverse);
-                label = -label;
-            }
-            preprocessing.to_input(planes, x);
-        });
-        Ok(Some(label))
-    }
-
     /// Whether a sample that takes the random numbers of `sample` is mirrored.
     fn is_mirrored(&self, sample: u32) -> bool {
         match self.flip {
@@ -363,43 +349,6 @@ impl Loader {
             Flip::Both => sample % 2 == 1,
             Flip::Random => unit(&mut rng(self.spec.seed, Purpose::Mirror, self.epoch, u64::from(sample))) < 0.5,
         }
-    }
-
-    /// Reads, decodes and preprocesses an image, up to the stage that is cached.
-    fn decode(
-        &self,
-        image: u32,
-        file: &mut Vec<u8>,
-        decoded: &mut RgbImage,
-        preprocessor: &mut Preprocessor,
-        out: &mut [u8],
-    ) -> std::result::Result<(), String> {
-        let (item, camera) = self.images[image as usize];
-        let Item { recording, row, .. } = self.items[item as usize];
-        let path = self.recordings[usize::from(recording)].image_path(row as usize, camera).ok_or("no such image")?;
-        let failed = |message: String| format!("{}: {message}", path.display());
-        self.times.decode.time(|| {
-            self.recordings[usize::from(recording)]
-                .read_picture(row as usize, camera, file)
-                .map_err(|error| error.to_string())?;
-            decode_rgb(file, decoded).map_err(failed)
-        })?;
-        if preprocessor.image_size() != [decoded.height, decoded.width] {
-            let planned = self.spec.preprocessing.plan(decoded.height, decoded.width);
-            *preprocessor = planned.map_err(|error| failed(error.to_string()))?;
-        }
-        if camera == View::Centre {
-            let Preprocessing { rows, source, .. } = self.spec.preprocessing;
-            self.thumbnails[item as usize].get_or_init(|| Thumbnail::of(decoded, rows, source[0]));
-        }
-        self.times.preprocess.time(|| {
-            if keeps_rgb(&self.spec, self.training) {
-                preprocessor.to_rgb_stage(&decoded.pixels, out);
-            } else {
-                preprocessor.apply(&decoded.pixels, out);
-            }
-        });
-        Ok(())
     }
 
     fn report(&self, image: u32, message: String) {
@@ -445,7 +394,7 @@ impl Loader {
                     file: Vec::new(),
                     image: RgbImage::default(),
                     preprocessor: spec.plan(spec.source[0], spec.source[1])?,
-                    cached: vec![0; cached_len(&self.spec, self.training)],
+                    cached: vec![0; cached_len(&self.spec, self.training, self.flip)],
                     rgb: vec![0; spec.rgb_len()],
                     planes: vec![0; spec.output_len()],
                 }
@@ -457,14 +406,19 @@ impl Loader {
     }
 }
 
-/// Whether images are cached at the RGB stage, because they are augmented in each epoch.
-fn keeps_rgb(spec: &LoaderSpec, training: bool) -> bool {
-    training && spec.augmentation.is_active()
+/// Whether images are cached at the RGB stage, because they are augmented in each epoch or mirrored with geometry.
+fn keeps_rgb(spec: &LoaderSpec, training: bool, flip: Flip) -> bool {
+    (training && spec.augmentation.is_active()) || (flip != Flip::None && spec.samples.mirror == Mirror::Geometry)
 }
 
 /// Bytes of a cached image.
-fn cached_len(spec: &LoaderSpec, training: bool) -> usize {
-    if keeps_rgb(spec, training) { spec.preprocessing.rgb_len() } else { spec.preprocessing.output_len() }
+fn cached_len(spec: &LoaderSpec, training: bool, flip: Flip) -> usize {
+    if keeps_rgb(spec, training, flip) { spec.preprocessing.rgb_len() } else { spec.preprocessing.output_len() }
+}
+
+/// How the validation side is mirrored.
+fn validation_flip(samples: &SampleSpec) -> Flip {
+    if samples.validation_flips { Flip::Both } else { Flip::None }
 }
 
 /// Every state of the guarded data is whole, so a thread that died with the lock does no harm.

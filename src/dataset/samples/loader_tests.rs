@@ -1,10 +1,13 @@
 use super::*;
+use crate::dataset::augment::ViewSpec;
 use crate::dataset::cache::Overflow;
 use crate::dataset::colour::Colour;
 use crate::dataset::load;
-use crate::dataset::samples::Balance;
+use crate::dataset::samples::{Balance, Correction, LabelSpec};
 use crate::dataset::split::{SplitMode, SplitSpec, split};
 use crate::dataset::testing::jpeg_of;
+use crate::engine::random::uniform;
+use crate::geometry::{Offset, PixelGrid, ViewWarp};
 use std::fs;
 use std::path::Path;
 
@@ -37,7 +40,7 @@ fn spec() -> LoaderSpec {
             offset: -0.5,
             ..Default::default()
         },
-        samples: SampleSpec { side_cameras: Some(0.25), flip: Flip::Both, ..Default::default() },
+        samples: SampleSpec { side_cameras: Some(Correction::Fixed(0.25)), flip: Flip::Both, ..Default::default() },
         augmentation: Augmentation::default(),
         batch: 32,
         seed: 11,
@@ -50,10 +53,28 @@ fn augmented() -> LoaderSpec {
         brightness: Some([0.8, 1.2]),
         shadow_probability: 0.5,
         shift_px: 4.0,
-        shift_steering_per_px: Some(0.01),
+        shift_steering_per_px: Some(Correction::Fixed(0.01)),
         ..Default::default()
     };
     LoaderSpec { augmentation, ..spec() }
+}
+
+/// Everything that goes by geometry, on the car's own mount.
+fn geometric() -> LoaderSpec {
+    let augmentation = Augmentation {
+        view: Some(ViewSpec { offset_m: 1.0, turn_deg: 6.0, probability: 0.7 }),
+        shift_px: 4.0,
+        shift_steering_per_px: Some(Correction::Geometry),
+        ..Default::default()
+    };
+    let samples = SampleSpec {
+        side_cameras: Some(Correction::Geometry),
+        flip: Flip::Random,
+        mirror: Mirror::Geometry,
+        validation_flips: true,
+        ..Default::default()
+    };
+    LoaderSpec { augmentation, samples, ..spec() }
 }
 
 fn recordings(folder: &Path, rows: usize) -> Arc<[Recording]> {
@@ -61,9 +82,13 @@ fn recordings(folder: &Path, rows: usize) -> Arc<[Recording]> {
     Arc::from([load(folder).unwrap()])
 }
 
+fn targets(recordings: &[Recording], spec: &LoaderSpec) -> Arc<Targets> {
+    Arc::new(Targets::of(recordings, &LabelSpec::default(), &spec.samples, &spec.augmentation))
+}
+
 fn divide(recordings: &[Recording], spec: &LoaderSpec) -> Split {
     let half = SplitSpec { mode: SplitMode::Blocks, validation_share: 0.3 };
-    split(recordings, &half, &spec.samples, &Balance::default(), spec.seed).unwrap()
+    split(recordings, &targets(recordings, spec), &half, &spec.samples, &Balance::default(), spec.seed).unwrap()
 }
 
 /// Stripes that no two of the first 256 rows have nearly in common.
@@ -91,12 +116,13 @@ fn epochs(loader: &mut Loader) -> Vec<(Vec<u32>, Vec<u32>, Vec<SampleId>)> {
 fn batches_do_not_depend_on_threads_or_cache() {
     let folder = tempfile::tempdir().unwrap();
     let recordings = recordings(folder.path(), 150);
-    for spec in [spec(), augmented()] {
+    for spec in [spec(), augmented(), geometric()] {
         let split = divide(&recordings, &spec);
         let run = |threads: usize, memory_bytes: usize, overflow: Overflow| {
             let cache = CacheSpec { memory_bytes, overflow, folder: None };
             let spec = LoaderSpec { cache, ..spec.clone() };
-            let (mut training, mut validation) = Loader::pair(&recordings, &split, &spec).unwrap();
+            let (mut training, mut validation) =
+                Loader::pair(&recordings, &targets(&recordings, &spec), &split, &spec).unwrap();
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
             pool.install(|| (epochs(&mut training), epochs(&mut validation)))
         };
@@ -117,7 +143,8 @@ fn an_epoch_shows_every_image_and_its_mirror_once() {
     let folder = tempfile::tempdir().unwrap();
     let recordings = recordings(folder.path(), 150);
     let split = divide(&recordings, &spec());
-    let (mut training, mut validation) = Loader::pair(&recordings, &split, &spec()).unwrap();
+    let (mut training, mut validation) =
+        Loader::pair(&recordings, &targets(&recordings, &spec()), &split, &spec()).unwrap();
     assert_eq!(training.images(), split.training.len() * 3);
     assert_eq!(validation.images(), split.validation.len());
     let batches = epochs(&mut training);
@@ -143,7 +170,7 @@ fn labels_follow_camera_and_mirror() {
     let mut spec = spec();
     spec.preprocessing.colour = Colour::Rgb;
     let split = divide(&recordings, &spec);
-    let loader = Loader::training(&recordings, &split, &spec).unwrap();
+    let loader = Loader::training(&recordings, &targets(&recordings, &spec), &split, &spec).unwrap();
     let mut batch = Batch::default();
     let (mut mirrors, width) = (0, 12);
     for i in 0..loader.batches() {
@@ -161,6 +188,86 @@ fn labels_follow_camera_and_mirror() {
     assert_eq!(mirrors * 2, loader.samples());
 }
 
+/// The RGB stage of the image of `camera` at `row`.
+fn rgb_stage(recording: &Recording, row: usize, camera: View, spec: &LoaderSpec) -> Vec<u8> {
+    let image = recording.picture(row, camera).unwrap();
+    let mut rgb = vec![0; spec.preprocessing.rgb_len()];
+    spec.preprocessing.plan(image.height, image.width).unwrap().to_rgb_stage(&image.pixels, &mut rgb);
+    rgb
+}
+
+/// The network's input for an RGB stage.
+fn input(rgb: &[u8], spec: &LoaderSpec) -> Vec<f32> {
+    let (mut planes, mut x) = (vec![0; spec.preprocessing.output_len()], vec![0.0; spec.preprocessing.output_len()]);
+    spec.preprocessing.plan(16, 24).unwrap().finish(rgb, &mut planes);
+    spec.preprocessing.to_input(&planes, &mut x);
+    x
+}
+
+#[test]
+fn views_come_from_the_nearest_camera_and_are_labelled_from_where_they_are_seen() {
+    let folder = tempfile::tempdir().unwrap();
+    let recordings = recordings(folder.path(), 150);
+    let mut spec = geometric();
+    spec.augmentation.shift_px = 0.0;
+    let split = divide(&recordings, &spec);
+    let targets = targets(&recordings, &spec);
+    let loader = Loader::training(&recordings, &targets, &split, &spec).unwrap();
+    let car = &recordings[0].geometry;
+    let grid = PixelGrid::part(car, [4.0 / 16.0, 1.0], [6, 12]);
+    let mut batch = Batch::default();
+    let mut seen = [0; 3];
+    for i in 0..loader.batches() {
+        loader.fill(i, &mut batch).unwrap();
+        for (k, (sample, x)) in batch.samples.iter().zip(batch.x.chunks_exact(3 * 6 * 12)).enumerate() {
+            let number = loader.order[i * 32 + k];
+            let view = spec.augmentation.view.unwrap().draw(&mut rng(11, Purpose::View, 0, number.into()));
+            let item = Item::new(0, sample.row, View::ALL);
+            // The cameras of the preset are 0.806 m to the left and 0.825 m to the right.
+            let (camera, taken_m) = match (view, sample.camera) {
+                (Some(Offset { right_m: ..-0.403, .. }), _) | (None, View::Left) => (View::Left, -0.806),
+                (Some(Offset { right_m: 0.4125.., .. }), _) | (None, View::Right) => (View::Right, 0.825),
+                _ => (View::Centre, 0.0),
+            };
+            seen[camera as usize] += usize::from(view.is_some());
+            let offset = view.unwrap_or(Offset { right_m: taken_m, ..Offset::default() });
+            let label = targets.beside(item, offset);
+            assert_eq!(batch.labels[k], if sample.mirrored { -label } else { label });
+            let taken = rgb_stage(&recordings[0], sample.row as usize, camera, &spec);
+            let mut warped = vec![0; taken.len()];
+            match (view, sample.mirrored) {
+                (None, false) => warped.copy_from_slice(&taken),
+                (_, false) => ViewWarp::new(car, grid, taken_m, offset).apply(&taken, &mut warped),
+                (_, true) => ViewWarp::mirrored(car, grid, taken_m, offset).apply(&taken, &mut warped),
+            }
+            assert_eq!(x, input(&warped, &spec), "row {} {camera:?} {view:?} {}", sample.row, sample.mirrored);
+        }
+    }
+    assert!(seen.iter().all(|&n| n > 30), "{seen:?}");
+}
+
+#[test]
+fn shifts_by_geometry_have_the_sign_of_the_picture_in_mirrored_worlds_too() {
+    let folder = tempfile::tempdir().unwrap();
+    let recordings = recordings(folder.path(), 150);
+    let mut spec = geometric();
+    spec.augmentation.view = None;
+    let split = divide(&recordings, &spec);
+    let targets = targets(&recordings, &spec);
+    let shifted = Loader::training(&recordings, &targets, &split, &spec).unwrap();
+    let mut batch = Batch::default();
+    shifted.fill(0, &mut batch).unwrap();
+    for (k, sample) in batch.samples.iter().enumerate() {
+        let item = Item::new(0, sample.row, View::ALL);
+        let plain = spec.samples.label(&targets, item, sample.camera) * if sample.mirrored { -1.0 } else { 1.0 };
+        let mut draw = rng(11, Purpose::Augment, 0, shifted.order[k].into());
+        let columns = (uniform(&mut draw, -4.0, 4.0) / 2.0).round();
+        // To the right where the picture went to the right, whichever world it shows.
+        let change = f64::from(batch.labels[k] - plain);
+        assert!(if columns == 0.0 { change == 0.0 } else { change * columns > 0.0 }, "{columns} {change}");
+    }
+}
+
 #[test]
 fn rows_stay_together_where_the_recipe_says_so() {
     let folder = tempfile::tempdir().unwrap();
@@ -169,7 +276,7 @@ fn rows_stay_together_where_the_recipe_says_so() {
     spec.samples.group = Group::Rows;
     spec.batch = 25; // four rows of six samples
     let split = divide(&recordings, &spec);
-    let loader = Loader::training(&recordings, &split, &spec).unwrap();
+    let loader = Loader::training(&recordings, &targets(&recordings, &spec), &split, &spec).unwrap();
     let mut batch = Batch::default();
     assert_eq!(loader.batches(), split.training.len().div_ceil(4));
     loader.fill(0, &mut batch).unwrap();
@@ -186,7 +293,7 @@ fn random_mirrors_change_from_epoch_to_epoch() {
     let mut spec = spec();
     spec.samples.flip = Flip::Random;
     let split = divide(&recordings, &spec);
-    let mut loader = Loader::training(&recordings, &split, &spec).unwrap();
+    let mut loader = Loader::training(&recordings, &targets(&recordings, &spec), &split, &spec).unwrap();
     assert_eq!(loader.samples(), loader.images());
     let batches = epochs(&mut loader);
     let mirrored = |batches: &[(Vec<u32>, Vec<u32>, Vec<SampleId>)]| {
@@ -205,9 +312,10 @@ fn broken_images_are_left_out_and_counted() {
     let recordings = recordings(folder.path(), 150);
     let path = recordings[0].image_path(0, View::Left).unwrap();
     fs::write(&path, b"\xff\xd8 no picture \xff\xd9").unwrap();
+    let wheel = Arc::new(Targets::wheel(&recordings));
     let none = SplitSpec { validation_share: 0.0, ..Default::default() };
-    let split = split(&recordings, &none, &spec().samples, &Balance::default(), 0).unwrap();
-    let mut loader = Loader::training(&recordings, &split, &spec()).unwrap();
+    let split = split(&recordings, &wheel, &none, &spec().samples, &Balance::default(), 0).unwrap();
+    let mut loader = Loader::training(&recordings, &wheel, &split, &spec()).unwrap();
     let batches = epochs(&mut loader);
     let samples: usize = batches.iter().map(|batch| batch.2.len()).sum();
     assert_eq!(samples, 2 * (loader.samples() - 2));
@@ -220,9 +328,11 @@ fn broken_images_are_left_out_and_counted() {
 fn near_twins_are_found_after_an_epoch() {
     let folder = tempfile::tempdir().unwrap();
     let recordings = recordings(folder.path(), 150);
+    let wheel = Arc::new(Targets::wheel(&recordings));
     let random = SplitSpec { mode: SplitMode::Random, validation_share: 0.2 };
-    let split = split(&recordings, &random, &spec().samples, &Balance::default(), 0).unwrap();
-    let (mut training, mut validation) = Loader::pair(&recordings, &split, &spec()).unwrap();
+    let split = split(&recordings, &wheel, &random, &spec().samples, &Balance::default(), 0).unwrap();
+    let (mut training, mut validation) =
+        Loader::pair(&recordings, &targets(&recordings, &spec()), &split, &spec()).unwrap();
     assert_eq!(validation.near_twins(&training).frames, 0);
     epochs(&mut training);
     epochs(&mut validation);
@@ -275,8 +385,9 @@ fn batches_hold_pairs_of_one_image_and_of_neighbours() {
     let recordings = recordings(folder.path(), 150);
     let none = SplitSpec { validation_share: 0.0, ..Default::default() };
     let spec = LoaderSpec { batch: 20, ..augmented() };
-    let split = split(&recordings, &none, &spec.samples, &Balance::default(), 0).unwrap();
-    let load = || Loader::training(&recordings, &split, &spec).unwrap();
+    let targets = targets(&recordings, &spec);
+    let split = split(&recordings, &targets, &none, &spec.samples, &Balance::default(), 0).unwrap();
+    let load = || Loader::training(&recordings, &targets, &split, &spec).unwrap();
     let batches = load().batches();
     assert_eq!(batches, 45);
     for (spatial, temporal, found) in [(1.0, 1.0, [3, 2]), (0.5, 0.0, [5, 0]), (0.0, 2.0, [0, 5])] {

@@ -2,6 +2,7 @@
 
 pub mod augment;
 mod balance;
+mod labels;
 pub mod leak;
 pub mod loader;
 mod pairs;
@@ -9,4 +10,5 @@ mod spec;
 pub mod split;
 
 pub use balance::Balance;
-pub use spec::{Flip, Group, Item, SampleSpec};
+pub use labels::{LabelKind, LabelSpec, Targets};
+pub use spec::{Correction, Flip, Group, Item, Mirror, SampleSpec};

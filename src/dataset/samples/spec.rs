@@ -1,8 +1,72 @@
 //! Which images of a row are used: the `[samples]` table of a recipe.
 
-use crate::dataset::recording::{Recording, View};
+use super::labels::Targets;
+use crate::dataset::recording::View;
+use crate::geometry::Offset;
 use crate::{Error, Result};
-use serde::{Deserialize, Serialize};
+use serde::de::Error as _;
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+
+/// How much a displaced view changes the label.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Correction {
+    /// By this much steering.
+    Fixed(f64),
+    /// As the mount of the camera, the speed and the driven path say; `"geometry"` in a recipe.
+    Geometry,
+}
+
+impl Correction {
+    /// The number, 0 for geometry.
+    pub fn fixed(self) -> f64 {
+        match self {
+            Correction::Fixed(steering) => steering,
+            Correction::Geometry => 0.0,
+        }
+    }
+}
+
+impl Serialize for Correction {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        match self {
+            Correction::Fixed(steering) => serializer.serialize_f64(*steering),
+            Correction::Geometry => serializer.serialize_str("geometry"),
+        }
+    }
+}
+
+impl<'de> Deserialize<'de> for Correction {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        #[derive(Deserialize)]
+        #[serde(untagged)]
+        enum Written {
+            Number(f64),
+            Word(String),
+        }
+        match Written::deserialize(deserializer) {
+            Ok(Written::Number(steering)) => Ok(Correction::Fixed(steering)),
+            Ok(Written::Word(word)) if word == "geometry" => Ok(Correction::Geometry),
+            _ => Err(D::Error::custom("expected a number or \"geometry\"")),
+        }
+    }
+}
+
+/// How a picture is mirrored.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Mirror {
+    /// Column by column: what a camera would see that is mounted the other way round.
+    #[default]
+    Picture,
+    /// The world is mirrored, and the camera stays as it is mounted: rolled and turned cameras see the horizon where it was.
+    Geometry,
+}
+
+impl Mirror {
+    fn is_picture(&self) -> bool {
+        *self == Mirror::Picture
+    }
+}
 
 /// Whether images are mirrored. A mirrored image has the negated label.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -33,11 +97,14 @@ pub enum Group {
 #[serde(deny_unknown_fields, default)]
 pub struct SampleSpec {
     /// Steering added to the label of the left camera and taken from the label of the right one, in the unit of the
-    /// labels. The sum is not clamped. Without it, only the centre camera is used.
+    /// labels; or `"geometry"`. The sum is not clamped. Without it, only the centre camera is used.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub side_cameras: Option<f64>,
+    pub side_cameras: Option<Correction>,
     /// Mirroring of training images.
     pub flip: Flip,
+    /// How they are mirrored.
+    #[serde(skip_serializing_if = "Mirror::is_picture")]
+    pub mirror: Mirror,
     /// Rows with this throttle or less are left out, on both sides of the split.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub min_throttle: Option<f64>,
@@ -55,8 +122,8 @@ impl SampleSpec {
     /// # Errors
     /// [`Error::Usage`] naming the key.
     pub fn validate(&self) -> Result<()> {
-        if self.side_cameras.is_some_and(|x| !(0.0..=1.0).contains(&x)) {
-            return Err(Error::Usage("[samples] side_cameras: must be 0 to 1 (full lock)".into()));
+        if self.side_cameras.is_some_and(|by| !(0.0..=1.0).contains(&by.fixed())) {
+            return Err(Error::Usage("[samples] side_cameras: must be 0 to 1 (full lock), or \"geometry\"".into()));
         }
         if self.min_throttle.is_some_and(|x| !x.is_finite()) {
             return Err(Error::Usage("[samples] min_throttle: must be a finite number".into()));
@@ -64,9 +131,26 @@ impl SampleSpec {
         Ok(())
     }
 
-    /// The label of an image, before it is mirrored: the steering of the row with the correction of the camera.
-    pub fn label(&self, steering: f32, camera: View) -> f32 {
-        steering + camera.correction_sign() * self.side_cameras.unwrap_or(0.0) as f32
+    /// The label of an image, before it is mirrored: that of the row with the correction of the camera.
+    ///
+    /// # Panics
+    /// If there is no such row, or the row has no label.
+    pub fn label(&self, targets: &Targets, item: Item, camera: View) -> f32 {
+        targets.beside(item, self.offset(targets, item, camera)) + self.added(camera)
+    }
+
+    /// Where a car would stand whose centre camera saw what `camera` saw; at the row's own place with a fixed correction.
+    pub(super) fn offset(&self, targets: &Targets, item: Item, camera: View) -> Offset {
+        let right_m = match self.side_cameras {
+            Some(Correction::Geometry) => targets.camera_right_m(item, camera),
+            _ => 0.0,
+        };
+        Offset { right_m, ..Offset::default() }
+    }
+
+    /// The fixed correction of `camera`.
+    pub(super) fn added(&self, camera: View) -> f32 {
+        camera.correction_sign() * self.side_cameras.map_or(0.0, Correction::fixed) as f32
     }
 }
 
@@ -91,33 +175,42 @@ impl Item {
     pub fn cameras(self) -> impl Iterator<Item = View> {
         View::ALL.into_iter().filter(move |&camera| self.cameras >> camera as u8 & 1 == 1)
     }
-
-    /// Steering of the row.
-    pub fn steering(self, recordings: &[Recording]) -> f32 {
-        recordings[usize::from(self.recording)].rows[self.row as usize].steering
-    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::dataset::samples::Balance;
+    use crate::dataset::testing::recording_of;
 
     #[test]
     fn labels_are_corrected_and_not_clamped() {
-        let spec = SampleSpec { side_cameras: Some(0.25), ..Default::default() };
-        assert_eq!(View::ALL.map(|camera| spec.label(1.0, camera)), [1.0, 1.25, 0.75]);
-        assert_eq!(SampleSpec::default().label(0.5, View::Left), 0.5);
+        let spec = SampleSpec { side_cameras: Some(Correction::Fixed(0.25)), ..Default::default() };
+        let targets = Targets::wheel(&[recording_of(&[1.0, 0.5], 100)]);
+        let item = |row| Item::new(0, row, [View::Centre]);
+        assert_eq!(View::ALL.map(|camera| spec.label(&targets, item(0), camera)), [1.0, 1.25, 0.75]);
+        assert_eq!(SampleSpec::default().label(&targets, item(1), View::Left), 0.5);
     }
 
     #[test]
     fn tables_read_from_toml_and_wrong_ones_are_errors() {
         let spec: SampleSpec =
             toml::from_str("side_cameras = 0.15\nflip = 'both'\ngroup = 'rows'\nvalidation_flips = true").unwrap();
-        assert_eq!((spec.flip, spec.group, spec.side_cameras), (Flip::Both, Group::Rows, Some(0.15)));
+        let by = Some(Correction::Fixed(0.15));
+        assert_eq!(
+            (spec.flip, spec.group, spec.side_cameras, spec.mirror),
+            (Flip::Both, Group::Rows, by, Mirror::Picture)
+        );
         assert!(spec.validate().is_ok());
+        let read = |text: &str| toml::from_str::<SampleSpec>(text).map_err(|error| error.message().to_string());
+        let geometric = read("side_cameras = 'geometry'\nmirror = 'geometry'").unwrap();
+        assert_eq!((geometric.side_cameras, geometric.mirror), (Some(Correction::Geometry), Mirror::Geometry));
+        assert_eq!(read(&toml::to_string(&geometric).unwrap()), Ok(geometric));
+        assert_eq!(read("side_cameras = 0").unwrap().side_cameras, Some(Correction::Fixed(0.0)));
+        assert_eq!(read("side_cameras = 'wide'"), Err("expected a number or \"geometry\"".into()));
+        assert!(!toml::to_string(&spec).unwrap().contains("mirror"), "recipes of today are written as they were");
         assert!(toml::from_str::<SampleSpec>("flips = 'both'").is_err());
-        assert!(SampleSpec { side_cameras: Some(25.0), ..spec }.validate().is_err());
+        assert!(SampleSpec { side_cameras: Some(Correction::Fixed(25.0)), ..spec }.validate().is_err());
         assert!(Balance { keep_zero: Some(1.5), ..Default::default() }.validate().is_err());
         assert!(Balance { histogram_bins: Some(5), ..Default::default() }.validate().is_err());
     }

@@ -4,7 +4,7 @@
 //! validation frame has a twin among the training frames, and the validation loss says little about new road. The
 //! default, `blocks`, holds out contiguous stretches of time with a guard of a second on both sides.
 
-use super::{Balance, Item, SampleSpec};
+use super::{Balance, Item, SampleSpec, Targets};
 use crate::dataset::recording::{Recording, View};
 use crate::engine::random::{Purpose, rng, shuffle, unit};
 use crate::{Error, Result};
@@ -92,18 +92,21 @@ pub struct Split {
     pub guard_rows: usize,
     /// Rows left out for their throttle.
     pub low_throttle_rows: usize,
+    /// Rows left out because the driven path does not say how to steer.
+    pub unlabelled_rows: usize,
     /// Rows left out to balance the labels.
     pub balanced_rows: usize,
     /// What the reader should know.
     pub notices: Vec<String>,
 }
 
-/// Splits the usable rows of `recordings`.
+/// Splits the usable rows of `recordings`, whose labels are `targets`.
 ///
 /// # Errors
 /// If a table is wrong, or if one of the sides would be empty.
 pub fn split(
     recordings: &[Recording],
+    targets: &Targets,
     spec: &SplitSpec,
     samples: &SampleSpec,
     balance: &Balance,
@@ -121,22 +124,25 @@ pub fn split(
         validation: Vec::new(),
         guard_rows: 0,
         low_throttle_rows: 0,
+        unlabelled_rows: 0,
         balanced_rows: 0,
         notices: Vec::new(),
     };
     match spec.mode {
         SplitMode::Blocks => split.by_blocks(recordings, seed),
-        SplitMode::Random => split.by_rows(recordings, samples, seed),
-        SplitMode::RandomImages => split.by_images(recordings, samples, balance, seed),
+        SplitMode::Random => split.by_rows(recordings, targets, samples, seed),
+        SplitMode::RandomImages => split.by_images(recordings, targets, samples, balance, seed),
     }
     if spec.mode == SplitMode::Blocks {
         split.low_throttle_rows = [&mut split.training, &mut split.validation]
             .map(|side| drop_low_throttle(side, recordings, samples))
             .iter()
             .sum();
+        split.unlabelled_rows =
+            [&mut split.training, &mut split.validation].map(|side| drop_unlabelled(side, targets)).iter().sum();
     }
     if spec.mode != SplitMode::RandomImages {
-        split.balanced_rows = balance.apply(&mut split.training, recordings, seed);
+        split.balanced_rows = balance.apply(&mut split.training, targets, seed);
         set_cameras(&mut split.training, recordings, samples.side_cameras.is_some());
     }
     let validate_sides = samples.side_cameras.is_some() && samples.validation_side_cameras;
@@ -175,6 +181,7 @@ impl Split {
         for (rows, why) in [
             (self.guard_rows, "within 1 s of a validation block, used on neither side"),
             (self.low_throttle_rows, "left out for low throttle"),
+            (self.unlabelled_rows, "left out because the car stands or its session ends, so that no path lies ahead"),
             (self.balanced_rows, "left out to balance the labels"),
         ] {
             if rows > 0 {
@@ -313,9 +320,10 @@ impl Split {
         ));
     }
 
-    fn by_rows(&mut self, recordings: &[Recording], samples: &SampleSpec, seed: u64) {
+    fn by_rows(&mut self, recordings: &[Recording], targets: &Targets, samples: &SampleSpec, seed: u64) {
         let mut rows = all_rows(recordings);
         self.low_throttle_rows = drop_low_throttle(&mut rows, recordings, samples);
+        self.unlabelled_rows = drop_unlabelled(&mut rows, targets);
         shuffle(&mut rng(seed, Purpose::Split, 0, 0), &mut rows);
         self.training = rows.split_off((self.spec.validation_share * rows.len() as f64).round() as usize);
         self.validation = rows;
@@ -323,10 +331,18 @@ impl Split {
         self.validation.sort_unstable();
     }
 
-    fn by_images(&mut self, recordings: &[Recording], samples: &SampleSpec, balance: &Balance, seed: u64) {
+    fn by_images(
+        &mut self,
+        recordings: &[Recording],
+        targets: &Targets,
+        samples: &SampleSpec,
+        balance: &Balance,
+        seed: u64,
+    ) {
         let mut rows = all_rows(recordings);
         self.low_throttle_rows = drop_low_throttle(&mut rows, recordings, samples);
-        self.balanced_rows = balance.apply(&mut rows, recordings, seed);
+        self.unlabelled_rows = drop_unlabelled(&mut rows, targets);
+        self.balanced_rows = balance.apply(&mut rows, targets, seed);
         set_cameras(&mut rows, recordings, samples.side_cameras.is_some());
         let mut images: Vec<Item> = rows
             .iter()
@@ -418,6 +434,12 @@ fn drop_low_throttle(items: &mut Vec<Item>, recordings: &[Recording], samples: &
             throttle.is_nan() || throttle > min
         });
     }
+    before - items.len()
+}
+
+fn drop_unlabelled(items: &mut Vec<Item>, targets: &Targets) -> usize {
+    let before = items.len();
+    items.retain(|item| targets.label(*item).is_some());
     before - items.len()
 }
 

@@ -1,6 +1,8 @@
 use super::*;
+use crate::dataset::augment::Augmentation;
 use crate::dataset::leak::LeakAudit;
 use crate::dataset::testing::{recording_of, recordings_folder};
+use crate::dataset::{Correction, LabelKind, LabelSpec};
 
 /// A recording of several sessions, each of `rows` rows every 100 ms, with a minute between them. The steering of
 /// session i is i / 10.
@@ -22,7 +24,7 @@ fn sessions(rows: &[usize]) -> Recording {
 
 fn run(recordings: &[Recording], mode: SplitMode, seed: u64) -> Split {
     let spec = SplitSpec { mode, validation_share: 0.2 };
-    split(recordings, &spec, &SampleSpec::default(), &Balance::default(), seed).unwrap()
+    split(recordings, &Targets::wheel(recordings), &spec, &SampleSpec::default(), &Balance::default(), seed).unwrap()
 }
 
 #[test]
@@ -86,10 +88,18 @@ fn a_single_short_session_is_cut_with_a_notice() {
     assert!((45..=55).contains(&split.validation.len()));
     assert!(split.summary().contains("those of at least 10 s are cut"));
     let tiny = [sessions(&[50])];
-    let error = super::split(&tiny, &SplitSpec::default(), &SampleSpec::default(), &Balance::default(), 0);
+    let error = super::split(
+        &tiny,
+        &Targets::wheel(&tiny),
+        &SplitSpec::default(),
+        &SampleSpec::default(),
+        &Balance::default(),
+        0,
+    );
     assert!(error.unwrap_err().to_string().contains("validation_share = 0"));
     let none = SplitSpec { validation_share: 0.0, ..Default::default() };
-    let split = super::split(&tiny, &none, &SampleSpec::default(), &Balance::default(), 0).unwrap();
+    let split =
+        super::split(&tiny, &Targets::wheel(&tiny), &none, &SampleSpec::default(), &Balance::default(), 0).unwrap();
     assert_eq!((split.training.len(), split.validation.len()), (50, 0));
 }
 
@@ -107,32 +117,52 @@ fn random_splits_leak_and_say_so() {
 #[test]
 fn images_of_a_row_fall_on_both_sides_with_random_images() {
     let recordings = [sessions(&[1000])];
-    let samples = SampleSpec { side_cameras: Some(0.25), validation_side_cameras: true, ..Default::default() };
+    let samples =
+        SampleSpec { side_cameras: Some(Correction::Fixed(0.25)), validation_side_cameras: true, ..Default::default() };
     let spec = SplitSpec { mode: SplitMode::RandomImages, validation_share: 0.1 };
-    let split = super::split(&recordings, &spec, &samples, &Balance::default(), 5).unwrap();
+    let split =
+        super::split(&recordings, &Targets::wheel(&recordings), &spec, &samples, &Balance::default(), 5).unwrap();
     let images = |side: &[Item]| side.iter().map(|item| item.cameras().count()).sum::<usize>();
     assert_eq!((images(&split.training), images(&split.validation)), (2700, 300));
     assert!(split.training.len() > 900 && split.validation.len() > 200);
     let centre_only = SampleSpec { validation_side_cameras: false, ..samples };
-    let split = super::split(&recordings, &spec, &centre_only, &Balance::default(), 5).unwrap();
+    let split =
+        super::split(&recordings, &Targets::wheel(&recordings), &spec, &centre_only, &Balance::default(), 5).unwrap();
     assert!(split.validation.iter().all(|item| item.cameras().eq([View::Centre])));
 }
 
 #[test]
 fn throttle_and_balance_leave_rows_out() {
-    let mut recording = sessions(&[2000]);
-    for (i, row) in recording.rows.iter_mut().enumerate() {
+    let mut recordings = [sessions(&[2000])];
+    for (i, row) in recordings[0].rows.iter_mut().enumerate() {
         row.throttle = [0.0, 0.5, f32::NAN, 1.0][i % 4];
     }
-    let samples = SampleSpec { min_throttle: Some(0.0), side_cameras: Some(0.2), ..Default::default() };
+    let samples =
+        SampleSpec { min_throttle: Some(0.0), side_cameras: Some(Correction::Fixed(0.2)), ..Default::default() };
     let balance = Balance { keep_zero: Some(0.5), ..Default::default() };
-    let split = super::split(&[recording], &SplitSpec::default(), &samples, &balance, 0).unwrap();
+    let split =
+        super::split(&recordings, &Targets::wheel(&recordings), &SplitSpec::default(), &samples, &balance, 0).unwrap();
     assert!(split.training.iter().chain(&split.validation).all(|item| item.row % 4 != 0));
     // Every label is 0, so half of the training rows go, and none of the validation rows.
     assert!(split.balanced_rows.abs_diff(split.training.len()) <= 1);
     assert!(split.low_throttle_rows > 450 && split.validation.len() > 280);
     assert!(split.training.iter().all(|item| item.cameras().count() == 3));
     assert!(split.validation.iter().all(|item| item.cameras().count() == 1));
+}
+
+#[test]
+fn rows_without_a_path_ahead_stand_on_no_side() {
+    let mut recordings = [sessions(&[2000, 800])];
+    recordings[0].rows[100].speed_mph = 0.0;
+    let labels = LabelSpec { kind: LabelKind::Path, ..LabelSpec::default() };
+    let targets = Targets::of(&recordings, &labels, &SampleSpec::default(), &Augmentation::default());
+    let spec = SplitSpec { mode: SplitMode::Random, validation_share: 0.2 };
+    let split = super::split(&recordings, &targets, &spec, &SampleSpec::default(), &Balance::default(), 0).unwrap();
+    // At 20 mph 0.7 s are 6.26 m and rows 0.894 m apart: the last 7 of each session; and where the car stands.
+    assert_eq!((split.unlabelled_rows, split.training.len() + split.validation.len()), (15, 2800 - 15));
+    let used = |row: u32| split.training.iter().chain(&split.validation).any(|item| item.row == row);
+    assert!(used(99) && !used(100) && used(1992) && !used(1993) && !used(2799));
+    assert!(split.summary().contains("15 rows left out because the car stands"), "{}", split.summary());
 }
 
 #[test]

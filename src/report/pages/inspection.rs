@@ -3,7 +3,7 @@
 use crate::dataset::colour::Colour;
 use crate::dataset::inspect::{Inspection, Suspicion, contradiction, seen_steering};
 use crate::dataset::preprocess::Preprocessing;
-use crate::dataset::{Recording, View};
+use crate::dataset::{Correction, Item, Recording, View};
 use crate::picture::RgbImage;
 use crate::recipe::Recipe;
 use crate::report::charts::chart::{Axis, Chart, Mark};
@@ -231,19 +231,24 @@ fn samples(page: &mut Page, recording: &Recording, recipe: &Recipe, count: usize
         [View::Left, View::Centre, View::Right].into_iter().filter(|&camera| recording.has(camera)).collect();
     let used = match recipe.samples.side_cameras {
         _ if cameras.len() < 2 => String::new(),
-        Some(by) => {
+        Some(Correction::Geometry) => "; the labels of the side cameras follow from where they are mounted".into(),
+        Some(Correction::Fixed(by)) => {
             format!("; the recipe adds {by} to the label of the left camera and takes it off that of the right")
         }
         None => "; the recipe uses the centre camera only".into(),
     };
     page.paragraph(&format!("From hard left to hard right{used}. A mirrored picture has the negated label."));
     let mut figures = Vec::new();
+    let targets = recipe.targets(std::slice::from_ref(recording));
     for row in from_left_to_right(recording, count) {
-        let (line, steering) = (recording.rows[row].line, recording.rows[row].steering);
+        let (line, item) = (recording.rows[row].line, Item::new(0, row as u32, [View::Centre]));
+        // The driven path does not say every label.
+        let label_of = |camera: View| targets.label(item).map(|_| recipe.samples.label(&targets, item, camera));
+        let said = |label: Option<f32>| label.map_or("none".into(), signed);
         for &camera in &cameras {
             let Some(image) = recording.picture(row, camera) else { continue };
             let label = if recipe.samples.side_cameras.is_some() || camera == View::Centre {
-                signed(recipe.samples.label(steering, camera))
+                said(label_of(camera))
             } else {
                 "unused".into()
             };
@@ -253,7 +258,7 @@ fn samples(page: &mut Page, recording: &Recording, recipe: &Recipe, count: usize
             {
                 figures.push(camera_figure(
                     &centre.mirrored(),
-                    format!("line {line}, centre mirrored: label {}", signed(-steering)),
+                    format!("line {line}, centre mirrored: label {}", said(label_of(View::Centre).map(|label| -label))),
                 ));
             }
         }
@@ -378,8 +383,8 @@ fn training(page: &mut Page, recordings: &[Recording], recipe: &Recipe, seed: u6
     page.section("Training and validation");
     let all: Vec<f32> = recordings.iter().flat_map(|r| r.rows.iter().map(|row| row.steering)).collect();
     let before = histogram("Before: labels as recorded", HALF, "rows", &all);
-    let split = crate::dataset::split::split(recordings, &recipe.split, &recipe.samples, &recipe.balance, seed);
-    match split {
+    let (spec, samples, balance) = (&recipe.split, &recipe.samples, &recipe.balance);
+    match crate::dataset::split::split(recordings, &recipe.targets(recordings), spec, samples, balance, seed) {
         Ok(split) => {
             let view = SplitView::of(recordings, &split, recipe);
             view.describe(page);

@@ -177,10 +177,9 @@ impl Strip {
 }
 
 fn training_labels(recordings: &[Recording], split: &Split, recipe: &Recipe) -> Vec<f32> {
-    let labels = split.training.iter().flat_map(|item| {
-        let steering = item.steering(recordings);
-        item.cameras().map(move |camera| recipe.samples.label(steering, camera))
-    });
+    let targets = &recipe.targets(recordings);
+    let labels = (split.training.iter())
+        .flat_map(|&item| item.cameras().map(move |camera| recipe.samples.label(targets, item, camera)));
     match recipe.samples.flip {
         Flip::None => labels.collect(),
         Flip::Both => labels.flat_map(|label| [label, -label]).collect(),
@@ -205,8 +204,9 @@ mod tests {
         let labels: Vec<f32> = (0..1200).map(|i| if i % 3 == 0 { 0.0 } else { 0.3 }).collect();
         let recordings = [recording_of(&labels, 100)];
         let recipe = Recipe::find("lenet", &[]).unwrap();
-        let split =
-            crate::dataset::split::split(&recordings, &recipe.split, &recipe.samples, &recipe.balance, 1).unwrap();
+        let targets = recipe.targets(&recordings);
+        let (spec, samples, balance) = (&recipe.split, &recipe.samples, &recipe.balance);
+        let split = crate::dataset::split::split(&recordings, &targets, spec, samples, balance, 1).unwrap();
         let view = SplitView::of(&recordings, &split, &recipe);
         let seconds = |wanted: RowFate| -> f64 {
             view.strips[0].stretches.iter().filter(|s| s.2 == wanted).map(|(from, to, _)| to - from).sum()

@@ -1,0 +1,310 @@
+//! What the label of a row is: the `labels` entry of a recipe, and the steering of a car that stands beside the driven path.
+
+use serde::{Deserialize, Serialize};
+
+use super::augment::Augmentation;
+use super::spec::{Correction, Item, Mirror, SampleSpec};
+use crate::dataset::driven::DrivenSessions;
+use crate::dataset::recording::{Recording, View};
+use crate::geometry::{CarGeometry, LookAhead, Offset, Pose};
+use crate::{Error, Result};
+
+/// Where the label of a row comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum LabelKind {
+    /// The recorded steering.
+    #[default]
+    Wheel,
+    /// The steering that leads to the point of the driven path a little way ahead (pure pursuit).
+    Path,
+}
+
+/// The `labels` entry of a recipe.
+///
+/// How far ahead the path is aimed at counts for `kind = "path"`, and for everything in a recipe that is `"geometry"`.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct LabelSpec {
+    /// Where labels come from.
+    pub kind: LabelKind,
+    /// How far ahead the driven path is aimed at, s.
+    pub look_ahead_s: f64,
+    /// But never nearer than this, wheelbases.
+    pub min_wheelbases: f64,
+}
+
+impl Default for LabelSpec {
+    fn default() -> Self {
+        Self { kind: LabelKind::Wheel, look_ahead_s: 0.7, min_wheelbases: 2.0 }
+    }
+}
+
+impl LabelSpec {
+    /// Whether this is what stands for an entry that is absent.
+    pub fn is_default(&self) -> bool {
+        *self == Self::default()
+    }
+
+    /// Checks the numbers.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] naming the key.
+    pub fn validate(&self) -> Result<()> {
+        if !(0.0..=10.0).contains(&self.look_ahead_s) {
+            return Err(Error::Usage("labels.look_ahead_s: must be 0 to 10 s".into()));
+        }
+        if !(0.5..=100.0).contains(&self.min_wheelbases) {
+            return Err(Error::Usage("labels.min_wheelbases: must be 0.5 to 100".into()));
+        }
+        Ok(())
+    }
+
+    fn look_ahead(&self, car: &CarGeometry) -> LookAhead {
+        LookAhead { seconds: self.look_ahead_s, min_m: self.min_wheelbases * car.wheelbase_m }
+    }
+}
+
+/// The labels of the rows of some recordings, and what they become for a car beside the driven path.
+#[derive(Debug)]
+pub struct Targets {
+    recordings: Vec<OfRecording>,
+    notices: Vec<String>,
+}
+
+#[derive(Debug)]
+struct OfRecording {
+    /// Label of each row; NaN for rows that have none.
+    labels: Vec<f32>,
+    /// Camera and car, and what each row aims at; only where something asks for geometry.
+    geometry: Option<(CarGeometry, Vec<Aim>)>,
+}
+
+/// The point that a driver aims at, seen from where the car is.
+#[derive(Debug, Clone, Copy)]
+struct Aim {
+    right_m: f32,
+    ahead_m: f32,
+    /// Way to it along the path.
+    look_ahead_m: f32,
+}
+
+impl Aim {
+    /// Steering of a car at `offset` from the row's own place.
+    fn steering(self, car: &CarGeometry, offset: Offset) -> f64 {
+        let (dx, dz) = (f64::from(self.right_m) - offset.right_m, f64::from(self.ahead_m) - offset.ahead_m);
+        let (sin, cos) = (libm::sin(offset.turn), libm::cos(offset.turn));
+        car.steering_towards(dx * cos - dz * sin, dx * sin + dz * cos, f64::from(self.look_ahead_m))
+    }
+}
+
+impl Targets {
+    /// The labels of `recordings` by `spec`, with the geometry that `samples` and `augmentation` ask for.
+    pub fn of(
+        recordings: &[Recording],
+        spec: &LabelSpec,
+        samples: &SampleSpec,
+        augmentation: &Augmentation,
+    ) -> Targets {
+        let geometry = spec.kind == LabelKind::Path
+            || samples.side_cameras == Some(Correction::Geometry)
+            || samples.mirror == Mirror::Geometry
+            || augmentation.view.is_some()
+            || augmentation.shift_steering_per_px == Some(Correction::Geometry);
+        let mut targets = Targets { recordings: Vec::new(), notices: Vec::new() };
+        for recording in recordings {
+            if geometry {
+                targets.add_driven(recording, spec);
+            } else {
+                targets.recordings.push(OfRecording { labels: steering(recording), geometry: None });
+            }
+        }
+        targets
+    }
+
+    /// The recorded steering of `recordings`, for samples that need no geometry.
+    pub fn wheel(recordings: &[Recording]) -> Targets {
+        Targets::of(recordings, &LabelSpec::default(), &SampleSpec::default(), &Augmentation::default())
+    }
+
+    fn add_driven(&mut self, recording: &Recording, spec: &LabelSpec) {
+        let car = &recording.geometry;
+        let driven = DrivenSessions::of(recording, car.clone());
+        let look_ahead = spec.look_ahead(car);
+        let mut aims = Vec::with_capacity(recording.rows.len());
+        for session in &driven.sessions {
+            for (row, &speed_mps) in session.speed_mps.iter().enumerate() {
+                let look_ahead_m = look_ahead.distance_m(speed_mps);
+                let here = session.path.poses()[row];
+                // Where the path ends the car is taken to go on as it is steered.
+                let there = session.path.pose_at(session.path.along_m(row) + look_ahead_m).unwrap_or_else(|| {
+                    let steering = f64::from(recording.rows[session.rows.start + row].steering);
+                    here.moved(look_ahead_m, car.curvature(steering))
+                });
+                let to = here.offset_to(there);
+                aims.push(Aim {
+                    right_m: to.right_m as f32,
+                    ahead_m: to.ahead_m as f32,
+                    look_ahead_m: look_ahead_m as f32,
+                });
+            }
+        }
+        let labels = match spec.kind {
+            LabelKind::Wheel => steering(recording),
+            LabelKind::Path => {
+                driven.path_labels(look_ahead).into_iter().map(|label| label.unwrap_or(f32::NAN)).collect()
+            }
+        };
+        self.notices.extend(recording.camera_notice());
+        if let Some(mps) = driven.assumed_speed_mps {
+            self.notices.push(format!("{}: no speed was recorded; {mps:.1} m/s is assumed", recording.path.display()));
+        }
+        self.recordings.push(OfRecording { labels, geometry: Some((car.clone(), aims)) });
+    }
+
+    /// What the user should know: camera presets and speeds that were assumed.
+    pub fn notices(&self) -> &[String] {
+        &self.notices
+    }
+
+    /// The label of a row; `None` where the driven path does not say it: the car stands, or its session ends.
+    ///
+    /// # Panics
+    /// If there is no such row.
+    pub fn label(&self, item: Item) -> Option<f32> {
+        let label = self.recordings[usize::from(item.recording)].labels[item.row as usize];
+        (!label.is_nan()).then_some(label)
+    }
+
+    /// Camera and car of a row, if something asks for geometry.
+    pub fn geometry(&self, item: Item) -> Option<&CarGeometry> {
+        self.recordings[usize::from(item.recording)].geometry.as_ref().map(|(car, _)| car)
+    }
+
+    /// The label of a car at `offset` from where it was at a row: that of the row, and by how much more the steering towards the path
+    /// turns there than from the row's own place. The label of the row itself if nothing asks for geometry.
+    ///
+    /// # Panics
+    /// If there is no such row, or the row has no label.
+    pub fn beside(&self, item: Item, offset: Offset) -> f32 {
+        let label = self.label(item).expect("rows without a label are on no side of a split");
+        match &self.recordings[usize::from(item.recording)].geometry {
+            Some((car, aims)) if offset != Offset::default() => {
+                let aim = aims[item.row as usize];
+                (f64::from(label) + aim.steering(car, offset) - aim.steering(car, Offset::default())) as f32
+            }
+            _ => label,
+        }
+    }
+
+    /// How far `camera` is to the right of the centre camera, m.
+    pub(super) fn camera_right_m(&self, item: Item, camera: View) -> f64 {
+        let [left_m, right_m] = self.geometry(item).map_or([0.0, 0.0], |car| car.side_offsets_m);
+        [0.0, left_m, right_m][camera as usize]
+    }
+
+    /// The geometry of all recordings in words, for a hash; nothing where none is asked for.
+    pub fn geometry_text(&self) -> String {
+        let cars = self.recordings.iter().filter_map(|recording| recording.geometry.as_ref());
+        cars.map(|(car, _)| format!("{car:?}\n")).collect()
+    }
+}
+
+/// The pose of a car whose picture was moved to the right by the angle `angle` (rad), as if its camera had turned to the left where it
+/// is: the rear axle swings to the right.
+pub(super) fn turn_of_camera(car: &CarGeometry, angle: f64) -> Offset {
+    let (sin, cos) = (libm::sin(angle), libm::cos(angle));
+    Offset { right_m: car.ahead_m * sin, ahead_m: car.ahead_m * (1.0 - cos), turn: -angle }
+}
+
+/// `then` seen from `first`, seen from the origin.
+pub(super) fn chained(first: Offset, then: Offset) -> Offset {
+    Pose::default().offset_to(Pose::default().displaced(first).displaced(then))
+}
+
+fn steering(recording: &Recording) -> Vec<f32> {
+    recording.rows.iter().map(|row| row.steering).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::dataset::testing::recording_of;
+
+    fn item(row: u32) -> Item {
+        Item::new(0, row, [View::Centre])
+    }
+
+    fn geometric() -> SampleSpec {
+        SampleSpec { side_cameras: Some(Correction::Geometry), ..SampleSpec::default() }
+    }
+
+    fn path() -> LabelSpec {
+        LabelSpec { kind: LabelKind::Path, ..LabelSpec::default() }
+    }
+
+    #[test]
+    fn labels_of_the_path_are_pursuit() {
+        // Straight on for 2 s, then a bend; 20 mph are 8.9408 m/s, so the aim of 0.7 s is 6.2586 m ahead.
+        let steering: Vec<f32> = (0..60).map(|row| if row < 20 { 0.0 } else { 0.5 }).collect();
+        let recordings = [recording_of(&steering, 100)];
+        let targets = Targets::of(&recordings, &path(), &SampleSpec::default(), &Augmentation::default());
+        assert_eq!(targets.label(item(5)), Some(0.0));
+        // On the circle the chord of the arc is steered at, which is a little shorter than the arc.
+        let label = targets.label(item(40)).unwrap();
+        assert!((label - 0.5).abs() < 0.01, "{label}");
+        // Row 15 sees the bend ahead, at half a row before row 20: it turns in earlier than the wheel did.
+        let before = targets.label(item(15)).unwrap();
+        assert!((0.01..0.1).contains(&before), "{before}");
+        assert_eq!(targets.label(item(58)), None, "its session ends");
+        let wheel = Targets::wheel(&recordings);
+        assert_eq!((wheel.label(item(15)), wheel.label(item(58))), (Some(0.0), Some(0.5)));
+        assert_eq!(wheel.beside(item(3), Offset { right_m: 1.0, ..Offset::default() }), 0.0);
+        assert!(targets.notices()[0].contains("`udacity` is assumed") && wheel.notices().is_empty());
+    }
+
+    #[test]
+    fn beside_the_path_the_label_leads_back() {
+        let mut recordings = [recording_of(&[0.0; 60], 100)];
+        recordings[0].rows.iter_mut().for_each(|row| row.speed_mph = 10.0 / 0.447_04);
+        let targets = Targets::of(&recordings, &LabelSpec::default(), &geometric(), &Augmentation::default());
+        // 10 m/s: 7 m ahead. From 0.8 m to the right: 2 * -0.8 / (49 + 0.64) 1/m, times 2.87 m, is atan 5.2851 deg of 25.
+        let aside = |right_m, turn| targets.beside(item(10), Offset { right_m, ahead_m: 0.0, turn });
+        assert!((aside(0.8, 0.0) + 0.211_40).abs() < 1e-4, "{}", aside(0.8, 0.0));
+        assert_eq!(aside(-0.8, 0.0), -aside(0.8, 0.0));
+        // Turned by 0.1 rad to the right, the aim is 7 sin(0.1) to the left: atan(2 * 0.69883 / 49 * 2.87) = 4.6806 deg.
+        assert!((aside(0.0, 0.1) + 0.187_22).abs() < 1e-4, "{}", aside(0.0, 0.1));
+        // Where the path ends the car would have gone straight on.
+        let end = targets.beside(item(59), Offset { right_m: 0.8, ..Offset::default() });
+        assert!((end - aside(0.8, 0.0)).abs() < 1e-6, "{end}");
+    }
+
+    #[test]
+    fn side_cameras_and_shifts_follow_from_the_mount() {
+        let mut recordings = [recording_of(&[0.1; 60], 100)];
+        recordings[0].rows.iter_mut().for_each(|row| row.speed_mph = 10.0 / 0.447_04);
+        recordings[0].geometry = CarGeometry { side_offsets_m: [-0.8, 0.8], ..recordings[0].geometry.clone() };
+        let targets = Targets::of(&recordings, &LabelSpec::default(), &geometric(), &Augmentation::default());
+        let [centre, left, right] = View::ALL.map(|camera| geometric().label(&targets, item(10), camera));
+        assert_eq!(centre, 0.1);
+        assert!((left - 0.1 - 0.211).abs() < 0.01 && (0.1 - right - 0.211).abs() < 0.01, "{left} {right}");
+        // A picture that moved to the right by one pixel: the aim 7 m ahead of the axle, 4.4 m ahead of the camera, lies
+        // 4.4 m / 138.56 = 31.8 mm to the right: 2 * 0.0318 / 49 * 2.87 rad of 25 deg.
+        let moved = targets.beside(item(10), turn_of_camera(&recordings[0].geometry, 1.0 / 138.564)) - 0.1;
+        assert!((moved - 0.0085).abs() < 2e-4, "{moved}");
+    }
+
+    #[test]
+    fn offsets_are_chained_and_wrong_entries_are_named() {
+        let first = Offset { right_m: 1.0, ahead_m: 0.0, turn: std::f64::consts::FRAC_PI_2 };
+        let both = chained(first, Offset { right_m: 0.0, ahead_m: 2.0, turn: 0.1 });
+        assert!((both.right_m - 3.0).abs() < 1e-12 && both.ahead_m.abs() < 1e-12);
+        assert!((both.turn - std::f64::consts::FRAC_PI_2 - 0.1).abs() < 1e-12);
+        for (text, named) in [("look_ahead_s = -1", "look_ahead_s"), ("min_wheelbases = nan", "min_wheelbases")] {
+            let error = toml::from_str::<LabelSpec>(text).unwrap().validate().unwrap_err().to_string();
+            assert!(error.contains(named), "{error}");
+        }
+        assert!(toml::from_str::<LabelSpec>("kind = 'line'").is_err());
+        assert!(toml::from_str::<LabelSpec>("kind = 'path'\nseconds = 1").is_err());
+    }
+}
