@@ -21,7 +21,7 @@ use crate::engine::network::{LayerSpec, Network};
 use crate::engine::optimizer::{AveragingSpec, OptimizerSpec, Schedule, ScheduleSpec};
 use crate::engine::tensor::Shape;
 use crate::error::{Error, Result};
-use crate::suggestion::did_you_mean;
+use crate::suggestion::{did_you_mean, meant, named_elsewhere};
 
 /// Name and text of each recipe that is built in, by name.
 pub const SHIPPED: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/recipes.rs"));
@@ -164,6 +164,25 @@ impl Recipe {
         recipe.check().map_err(wrong)?;
         recipe.network(Isa::PORTABLE)?;
         Ok(recipe)
+    }
+
+    /// The entry of recipes that is called `name`, or that other libraries call so: `lr` is `optimizer.learning_rate`.
+    pub(crate) fn key_like(name: &str) -> Option<String> {
+        let table: toml::Table = Recipe::find("default", &[]).ok()?.to_toml().ok()?.parse().ok()?;
+        let mut keys = Vec::new();
+        for (key, value) in &table {
+            match value {
+                toml::Value::Table(inner) => keys.extend(inner.keys().map(|inner| format!("{key}.{inner}"))),
+                _ => keys.push(key.clone()),
+            }
+        }
+        let name = name.replace('-', "_");
+        let names: Vec<&str> = keys.iter().map(|key| key.rsplit('.').next().unwrap_or(key)).collect();
+        let meant = meant(&name, &names).filter(|meant| {
+            let near = strsim::damerau_levenshtein(&name, meant) <= 1;
+            near || named_elsewhere(&name) == Some(meant)
+        })?;
+        keys.iter().zip(&names).find(|(_, name)| **name == meant).map(|(key, _)| key.clone())
     }
 
     /// The text of a recipe file with every entry resolved.

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use clap::{Args, ValueEnum};
 
 use super::progress::JobDisplay;
+use super::recording_args::RecordingArgs;
 use super::{RecipeArgs, or_dash, pool, print_json, refuse_existing, stop_on_ctrl_c};
 use crate::dataset::held_out::{self, trained_on_held_out};
 use crate::error::{Error, Result};
@@ -37,6 +38,8 @@ pub struct ExperimentArgs {
     /// Train on these recordings instead of the simulator's
     #[arg(long = "recording", value_name = "RECORDING")]
     recordings: Vec<PathBuf>,
+    #[command(flatten)]
+    reading: RecordingArgs,
     /// Train on recordings of held-out tracks all the same
     #[arg(long, requires = "recordings")]
     force_held_out: bool,
@@ -69,7 +72,8 @@ pub fn run(args: ExperimentArgs) -> Result<()> {
     if args.runs == 0 {
         return Err(Error::Usage("--runs 0: at least 1 run is needed".into()));
     }
-    let held_out = held_out::check(&args.recordings, args.force_held_out)?;
+    let given = args.reading.expand(args.recordings)?;
+    let held_out = held_out::check(&given, args.force_held_out)?;
     if !held_out.is_empty() {
         eprintln!("note: {}", trained_on_held_out(&held_out));
     }
@@ -90,19 +94,28 @@ pub fn run(args: ExperimentArgs) -> Result<()> {
     let (pool, mut display) = (pool(args.threads)?, JobDisplay::new(&stop));
     // A file that cannot be written is told before hours are spent.
     let out = new_csv(args.out, args.subject)?;
-    let recordings = match args.recordings.is_empty() {
+    let recordings = match given.is_empty() {
         true => {
             let takes = takes(args.random_tracks as usize);
             pool.install(|| training_set(RECORDINGS.as_ref(), &takes, &mut display, &stop))
         }
-        false => Ok(args.recordings),
+        false => Ok(given),
     };
     let recordings = recordings.inspect_err(|_| drop(std::fs::remove_file(&out)))?;
     let subject = match args.subject {
         SubjectArg::Split => Subject::Split,
         SubjectArg::Colour => Subject::Colour,
     };
-    let plan = ExperimentPlan { subject, recipe, seeds, recordings, tracks, runs, cache_mib: args.cache };
+    let plan = ExperimentPlan {
+        subject,
+        recipe,
+        seeds,
+        recordings,
+        said: args.reading.said(),
+        tracks,
+        runs,
+        cache_mib: args.cache,
+    };
     let mut done = Vec::new();
     let mut observer = |event| match event {
         ExperimentEvent::Job(event) => display.observe(event),

@@ -67,6 +67,8 @@ pub struct ExperimentPlan {
     pub seeds: u64,
     /// Recordings that are trained on.
     pub recordings: Vec<PathBuf>,
+    /// What the user says about them.
+    pub said: Description,
     /// Tracks that are driven.
     pub tracks: Vec<String>,
     /// Runs on each track, of one lap.
@@ -142,7 +144,7 @@ pub fn run(
             observer.observe(ExperimentEvent::Job(JobEvent::Notice(format!("{variant}, seed {seed}"))))?;
             let request = TrainRequest {
                 recordings: plan.recordings.clone(),
-                said: Description::default(),
+                said: plan.said.clone(),
                 recipe: recipe.clone(),
                 out: folder.path().join(format!("{variant}-{seed}")),
                 seed,
