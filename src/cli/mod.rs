@@ -18,6 +18,7 @@ macro_rules! eprintln {
 mod bench;
 mod compare;
 mod drive;
+mod drive_sweep;
 mod evaluate;
 mod experiment;
 mod explain;
