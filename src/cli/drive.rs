@@ -302,7 +302,7 @@ fn summary_text(model: &str, s: &DriveSummary) -> String {
          off the road               {:.1} s\n\
          crashes                    {}\n\
          mean speed                 {:.1} mph\n\
-         whiteness                  {:.1} deg/s (expert {:.1})\n\
+         whiteness                  {:.1} deg/s (expert {:.1})\n{}\
          real-time factor           {:.1}\n",
         s.track,
         s.runs,
@@ -320,6 +320,23 @@ fn summary_text(model: &str, s: &DriveSummary) -> String {
         s.mean_speed_mph,
         s.whiteness_deg_s,
         s.expert_whiteness_deg_s,
+        calm_text(s),
         s.realtime_factor
+    )
+}
+
+/// The measures of calm beside the expert's, a line each.
+fn calm_text(s: &DriveSummary) -> String {
+    let (Some(calm), Some(expert)) = (&s.calm, &s.expert_calm) else { return String::new() };
+    format!(
+        "wheel reversals            {:.1} a minute (expert {:.1})\n\
+         angle's change, 95 %       {:.2} deg a frame (expert {:.2})\n\
+         lateral jerk, RMS          {:.1} m/s³ (expert {:.1})\n",
+        calm.reversals_per_min,
+        expert.reversals_per_min,
+        calm.angle_change_p95_deg,
+        expert.angle_change_p95_deg,
+        calm.lateral_jerk_rms_mps3,
+        expert.lateral_jerk_rms_mps3
     )
 }
