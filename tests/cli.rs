@@ -50,6 +50,15 @@ fn train_evaluate_and_predict_fit_together() {
     assert!(summary.starts_with(&format!("model {model}\nrecipe lenet: ")), "{summary}");
 }
 
+#[test]
+fn a_recording_is_trained_with_the_recipe_for_recordings() {
+    let folder = folder_with_log(150);
+    let result = json(folder.path(), &["train", "log", "--set", "epochs=1", "--json"]);
+    assert!(result["model"].as_str().unwrap().contains("recording-1"), "{result}");
+    let recipe = fs::read_to_string(folder.path().join("runs/recording-1/recipe.toml")).unwrap();
+    assert!(recipe.contains("kind = \"path\""), "{recipe}");
+}
+
 fn first_image(folder: &Path, camera: &str) -> String {
     let names = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().file_name().into_string().unwrap());
     names.filter(|name| name.starts_with(camera)).min().unwrap()
