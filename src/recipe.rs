@@ -15,8 +15,8 @@ use steersman_kernels::{Backend, Isa};
 use crate::dataset::augment::Augmentation;
 use crate::dataset::preprocess::Preprocessing;
 use crate::dataset::split::SplitSpec;
-use crate::dataset::{Balance, LabelSpec, Recording, SampleSpec, Targets};
-use crate::engine::loss::Loss;
+use crate::dataset::{Balance, Group, LabelSpec, Recording, SampleSpec, Targets};
+use crate::engine::loss::{Loss, Smoothness};
 use crate::engine::network::{LayerSpec, Network};
 use crate::engine::optimizer::{AveragingSpec, OptimizerSpec, Schedule, ScheduleSpec};
 use crate::engine::tensor::Shape;
@@ -48,6 +48,9 @@ pub struct Recipe {
     /// The function that training minimizes.
     #[serde(default)]
     pub loss: Loss,
+    /// Terms added to the loss that make the wheel calm; none when absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub smoothness: Option<Smoothness>,
     /// Gradients with a larger L2 norm are scaled down to this one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub clip_gradient_norm: Option<f64>,
@@ -253,6 +256,15 @@ impl Recipe {
         {
             return Err(format!("loss.delta must be a positive number, not {delta}"));
         }
+        if let Some(smoothness) = &self.smoothness {
+            smoothness.check(self.batch).map_err(|message| format!("[smoothness] {message}"))?;
+            if !smoothness.is_off() && self.samples.group == Group::Rows {
+                return Err(
+                    "[smoothness] pairs are made of single images, not of rows: samples.group must be \"images\""
+                        .into(),
+                );
+            }
+        }
         self.optimizer.check().map_err(|message| format!("[optimizer] {message}"))?;
         if let Some(averaging) = &self.averaging {
             averaging.check().map_err(|message| format!("averaging: {message}"))?;
@@ -376,6 +388,10 @@ mod tests {
         assert!(error(&["preprocessing.rows=[10, 200]"]).contains("rows"));
         assert!(error(&["preprocessing.resize=[4, 4]"]).contains("layer `pool1`"));
         assert!(error(&["keep=last", "early_stopping={patience_epochs=1}"]).contains("keeps the best epoch"));
+        assert!(error(&["smoothness={spatial=-1}"]).contains("[smoothness] spatial must not be negative"));
+        assert!(error(&["smoothness={spatial=1}", "batch=2"]).contains("leaves no pair"));
+        assert!(error(&["smoothness={spacial=1}"]).contains("did you mean `spatial`?"));
+        assert!(error(&["smoothness={temporal=1}", "samples.group=rows"]).contains("samples.group"));
         assert!(error(&["averaging={kind='ema', decay=1}"]).contains("averaging: decay must lie in [0, 1)"));
         assert!(error(&["averaging={kind='ema', decays=0.9}"]).contains("did you mean `decay`?"));
         assert!(error(&["name='../x'"]).contains("letters, digits"));

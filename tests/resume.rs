@@ -78,14 +78,15 @@ fn a_killed_run_goes_on_to_the_same_bits() {
     assert_same_result(folder.path(), "killed", &whole);
 }
 
-/// An average whose running statistics are fitted anew, and one whose statistics are averaged.
+/// An average whose running statistics are fitted anew, and one whose statistics are averaged; batches hold pairs.
 #[test]
 fn a_killed_run_goes_on_to_the_same_averaged_weights() {
     let folder = tempfile::tempdir().unwrap();
     painted_log::write(&folder.path().join("log"), 400, "");
     let layers = "layers=[{kind='conv2d', filters=4, kernel=[3, 3], stride=[2, 2]}, {kind='batch_norm'}, {kind='relu'}, \
                   {kind='flatten'}, {kind='dense', units=1}]";
-    let of = |averaging| [&ARGS[..], &["--set", layers, "--set", averaging]].concat();
+    let pairs = "smoothness={pairs_share=1.0, spatial=1.0, temporal=1.0}";
+    let of = |averaging| [&ARGS[..], &["--set", layers, "--set", averaging, "--set", pairs]].concat();
     let mut hashes = Vec::new();
     for averaging in ["averaging={kind='ema', decay=0.99, refit_batches=5}", "averaging={kind='swa', from_share=0.3}"] {
         let args = of(averaging);

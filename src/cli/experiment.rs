@@ -1,4 +1,4 @@
-//! `steersman experiment`: the two experiments of the write-ups, each to the end of the road.
+//! `steersman experiment`: the two experiments of the write-ups and what makes the wheel calm, each to the end of the road.
 
 use std::path::PathBuf;
 
@@ -15,7 +15,7 @@ use crate::main_job::training_set::RANDOM_TRACKS;
 use crate::observer::Observer;
 use crate::simulator::Track;
 
-/// Compare splits or colour spaces: what the validation loss promises beside what the drive delivers
+/// Compare splits, colour spaces or what makes the wheel calm: what the validation loss promises beside what the drive delivers
 #[derive(Debug, Args)]
 pub struct ExperimentArgs {
     /// What is varied
@@ -66,6 +66,8 @@ enum SubjectArg {
     Split,
     /// RGB, YUV, HSV, the saturation alone, grey
     Colour,
+    /// Averaged weights, terms of smoothness, blur before strides: what makes the wheel calm
+    Smooth,
 }
 
 pub fn run(args: ExperimentArgs) -> Result<()> {
@@ -105,6 +107,7 @@ pub fn run(args: ExperimentArgs) -> Result<()> {
     let subject = match args.subject {
         SubjectArg::Split => Subject::Split,
         SubjectArg::Colour => Subject::Colour,
+        SubjectArg::Smooth => Subject::Smooth,
     };
     let plan = ExperimentPlan {
         subject,
@@ -151,6 +154,7 @@ fn new_csv(out: Option<PathBuf>, subject: SubjectArg) -> Result<PathBuf> {
     let name = match subject {
         SubjectArg::Split => "split",
         SubjectArg::Colour => "colour",
+        SubjectArg::Smooth => "smooth",
     };
     let of_number = |n: u32| PathBuf::from(format!("runs/experiment-{name}-{n}.csv"));
     let out = out.unwrap_or_else(|| (1..).map(of_number).find(|path| !path.exists()).expect("numbers go on"));
@@ -196,6 +200,25 @@ fn print_table(plan: &ExperimentPlan, trials: &[ExperimentRow]) {
             mean(&|t| t.autonomy_percent),
             mean(&|t| t.cte_mean_m),
         );
+    }
+    if plan.subject == Subject::Smooth {
+        println!("variant         whiteness (worst)        reversals        change a frame, 95 %     lateral jerk");
+        let mut variants: Vec<&str> = trials.iter().map(|trial| trial.variant.as_str()).collect();
+        variants.dedup();
+        for variant in variants {
+            let of: Vec<&ExperimentRow> = trials.iter().filter(|trial| trial.variant == variant).collect();
+            let mean = |f: &dyn Fn(&ExperimentRow) -> f64| of.iter().map(|t| f(t)).sum::<f64>() / of.len() as f64;
+            println!(
+                "{variant:<13} {:>5.1} deg/s ({:.1}) {:>12.1} a minute {:>16.2} deg {:>14.1} m/s³",
+                mean(&|t| t.whiteness_deg_s),
+                of.iter().map(|t| t.worst_whiteness_deg_s).fold(0.0, f64::max),
+                mean(&|t| t.reversals_per_min),
+                mean(&|t| t.angle_change_p95_deg),
+                mean(&|t| t.lateral_jerk_rms_mps3),
+            );
+        }
+        let expert = trials.iter().map(|t| t.expert_whiteness_deg_s).sum::<f64>() / trials.len() as f64;
+        println!("the expert's whiteness there is {expert:.1} deg/s; the worst is that of a track and a training");
     }
     println!(
         "means over the trainings; in brackets the least and most. leak: validation frames with a training frame of the same\n\

@@ -46,7 +46,7 @@ enum Answer {
 }
 
 pub fn run(args: InspectArgs) -> Result<()> {
-    let recipe = args.recipe.find()?;
+    let recipe = args.recipe.find_or("recording")?;
     args.out.as_deref().map_or(Ok(()), refuse_existing)?;
     let (pool, stop) = (pool(args.threads)?, stop_on_ctrl_c()?);
     let said = args.reading.said();

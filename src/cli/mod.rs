@@ -18,6 +18,7 @@ macro_rules! eprintln {
 mod bench;
 mod compare;
 mod drive;
+mod drive_sweep;
 mod evaluate;
 mod experiment;
 mod explain;
@@ -205,7 +206,8 @@ fn recipe_entry(error: &clap::Error, args: Vec<String>) -> Option<String> {
 /// Which recipe, and what to change in it.
 #[derive(Clone, Debug, Args)]
 struct RecipeArgs {
-    /// A built-in recipe (default, hyper, hyper-prelu, lenet, pilotnet) or a recipe file [default: default]
+    /// A built-in recipe (default, recording, hyper, hyper-prelu, lenet, pilotnet) or a recipe file [default: recording
+    /// with a recording, else default]
     #[arg(long, value_name = "NAME|FILE")]
     recipe: Option<String>,
     /// Change an entry of the recipe, as in epochs=3 or optimizer.learning_rate=1e-4
@@ -215,7 +217,12 @@ struct RecipeArgs {
 
 impl RecipeArgs {
     fn find(&self) -> Result<Recipe> {
-        Recipe::find(self.recipe.as_deref().unwrap_or("default"), &self.overrides)
+        self.find_or("default")
+    }
+
+    /// The recipe that is named, or else the built-in one called `default`.
+    fn find_or(&self, default: &str) -> Result<Recipe> {
+        Recipe::find(self.recipe.as_deref().unwrap_or(default), &self.overrides)
     }
 
     /// The recipe that is named, or else that of the model in the file `from`.

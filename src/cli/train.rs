@@ -96,7 +96,8 @@ pub fn run(args: TrainArgs) -> Result<()> {
     let from = from.map(|model| TransferRequest { model, freeze: args.freeze });
     let recipe = || match &from {
         Some(from) => args.recipe.find_or_of(&from.model),
-        None => args.recipe.find(),
+        None if args.recordings.is_empty() => args.recipe.find(),
+        None => args.recipe.find_or("recording"),
     };
     let note = match &args.resume {
         Some(folder) => JobNote::read(folder)?,

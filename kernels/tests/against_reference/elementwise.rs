@@ -2,7 +2,7 @@
 
 use super::{Failures, isas, nans, numbers};
 use steersman_kernels::update::AdamStep;
-use steersman_kernels::{activation, norm, pixels, pool, reference, update};
+use steersman_kernels::{activation, blur, norm, pixels, pool, reference, update};
 
 /// Lengths around the vector widths.
 const LENGTHS: &[usize] = &[0, 1, 3, 4, 5, 15, 16, 17, 31, 100, 1027];
@@ -135,6 +135,14 @@ fn pooling_agrees_with_the_loops() {
                 reference::average_forward(&shape, n, &x, &mut expected);
                 pool::average_forward(isa, &shape, n, &x, &mut actual);
                 failures.compare(&format!("average_forward {what}"), &actual, &expected, 1e-6);
+                let (mut expected, mut actual, mut row) = (nans(n * y_len), nans(n * y_len), nans(w));
+                reference::blur_forward(&shape, n, &x, &mut expected);
+                blur::blur_forward(isa, &shape, n, &x, &mut actual, &mut row);
+                failures.compare(&format!("blur_forward {what}"), &actual, &expected, 1e-6);
+                let (mut expected, mut actual, mut row) = (nans(n * x_len), nans(n * x_len), nans(w));
+                reference::blur_backward(&shape, n, &dy, &mut expected);
+                blur::blur_backward(isa, &shape, n, &dy, &mut actual, &mut row);
+                failures.compare(&format!("blur_backward {what}"), &actual, &expected, 1e-6);
                 let (mut expected, mut actual) = (nans(n * x_len), nans(n * x_len));
                 reference::average_backward(&shape, n, &dy, &mut expected);
                 pool::average_backward(isa, &shape, n, &dy, &mut actual);
