@@ -15,13 +15,13 @@ use steersman_kernels::{Backend, Isa};
 use crate::dataset::augment::Augmentation;
 use crate::dataset::preprocess::Preprocessing;
 use crate::dataset::split::SplitSpec;
-use crate::dataset::{Balance, LabelSpec, Recording, SampleSpec, Targets};
-use crate::engine::loss::Loss;
+use crate::dataset::{Balance, Group, LabelSpec, Recording, SampleSpec, Targets};
+use crate::engine::loss::{Loss, Smoothness};
 use crate::engine::network::{LayerSpec, Network};
 use crate::engine::optimizer::{AveragingSpec, OptimizerSpec, Schedule, ScheduleSpec};
 use crate::engine::tensor::Shape;
 use crate::error::{Error, Result};
-use crate::suggestion::did_you_mean;
+use crate::suggestion::{did_you_mean, meant, named_elsewhere};
 
 /// Name and text of each recipe that is built in, by name.
 pub const SHIPPED: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/recipes.rs"));
@@ -48,6 +48,9 @@ pub struct Recipe {
     /// The function that training minimizes.
     #[serde(default)]
     pub loss: Loss,
+    /// Terms added to the loss that make the wheel calm; none when absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub smoothness: Option<Smoothness>,
     /// Gradients with a larger L2 norm are scaled down to this one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub clip_gradient_norm: Option<f64>,
@@ -163,6 +166,25 @@ impl Recipe {
         Ok(recipe)
     }
 
+    /// The entry of recipes that is called `name`, or that other libraries call so: `lr` is `optimizer.learning_rate`.
+    pub(crate) fn key_like(name: &str) -> Option<String> {
+        let table: toml::Table = Recipe::find("default", &[]).ok()?.to_toml().ok()?.parse().ok()?;
+        let mut keys = Vec::new();
+        for (key, value) in &table {
+            match value {
+                toml::Value::Table(inner) => keys.extend(inner.keys().map(|inner| format!("{key}.{inner}"))),
+                _ => keys.push(key.clone()),
+            }
+        }
+        let name = name.replace('-', "_");
+        let names: Vec<&str> = keys.iter().map(|key| key.rsplit('.').next().unwrap_or(key)).collect();
+        let meant = meant(&name, &names).filter(|meant| {
+            let near = strsim::damerau_levenshtein(&name, meant) <= 1;
+            near || named_elsewhere(&name) == Some(meant)
+        })?;
+        keys.iter().zip(&names).find(|(_, name)| **name == meant).map(|(key, _)| key.clone())
+    }
+
     /// The text of a recipe file with every entry resolved.
     ///
     /// # Errors
@@ -233,6 +255,15 @@ impl Recipe {
             && !(delta.is_finite() && delta > 0.0)
         {
             return Err(format!("loss.delta must be a positive number, not {delta}"));
+        }
+        if let Some(smoothness) = &self.smoothness {
+            smoothness.check(self.batch).map_err(|message| format!("[smoothness] {message}"))?;
+            if !smoothness.is_off() && self.samples.group == Group::Rows {
+                return Err(
+                    "[smoothness] pairs are made of single images, not of rows: samples.group must be \"images\""
+                        .into(),
+                );
+            }
         }
         self.optimizer.check().map_err(|message| format!("[optimizer] {message}"))?;
         if let Some(averaging) = &self.averaging {
@@ -357,6 +388,10 @@ mod tests {
         assert!(error(&["preprocessing.rows=[10, 200]"]).contains("rows"));
         assert!(error(&["preprocessing.resize=[4, 4]"]).contains("layer `pool1`"));
         assert!(error(&["keep=last", "early_stopping={patience_epochs=1}"]).contains("keeps the best epoch"));
+        assert!(error(&["smoothness={spatial=-1}"]).contains("[smoothness] spatial must not be negative"));
+        assert!(error(&["smoothness={spatial=1}", "batch=2"]).contains("leaves no pair"));
+        assert!(error(&["smoothness={spacial=1}"]).contains("did you mean `spatial`?"));
+        assert!(error(&["smoothness={temporal=1}", "samples.group=rows"]).contains("samples.group"));
         assert!(error(&["averaging={kind='ema', decay=1}"]).contains("averaging: decay must lie in [0, 1)"));
         assert!(error(&["averaging={kind='ema', decays=0.9}"]).contains("did you mean `decay`?"));
         assert!(error(&["name='../x'"]).contains("letters, digits"));

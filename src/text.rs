@@ -32,6 +32,11 @@ pub(crate) fn excerpt(text: &str, max_chars: usize) -> String {
     }
 }
 
+/// A share in percent; one that is not 0 never reads as 0.
+pub(crate) fn percent(value: f64) -> String {
+    if value > 0.0 && value < 0.05 { "<0.1".into() } else { format!("{value:.1}") }
+}
+
 /// A JSON text with the characters that a terminal would obey written as `\u001b`. They can stand in strings alone, so the
 /// value stays the same.
 pub(crate) fn escaped_json(json: &str) -> Cow<'_, str> {
@@ -83,6 +88,11 @@ mod tests {
     fn excerpts_are_cut_before_they_are_escaped() {
         assert_eq!(excerpt("a\u{1b}bc", 2), "a\\u{1b}…");
         assert_eq!(excerpt("äöü", 3), "äöü");
+    }
+
+    #[test]
+    fn only_nothing_reads_as_zero_percent() {
+        assert_eq!([0.0, 0.001, 0.049, 0.05, 68.84].map(percent), ["0.0", "<0.1", "<0.1", "0.1", "68.8"]);
     }
 
     #[test]

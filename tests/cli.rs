@@ -50,6 +50,15 @@ fn train_evaluate_and_predict_fit_together() {
     assert!(summary.starts_with(&format!("model {model}\nrecipe lenet: ")), "{summary}");
 }
 
+#[test]
+fn a_recording_is_trained_with_the_recipe_for_recordings() {
+    let folder = folder_with_log(150);
+    let result = json(folder.path(), &["train", "log", "--set", "epochs=1", "--json"]);
+    assert!(result["model"].as_str().unwrap().contains("recording-1"), "{result}");
+    let recipe = fs::read_to_string(folder.path().join("runs/recording-1/recipe.toml")).unwrap();
+    assert!(recipe.contains("kind = \"path\""), "{recipe}");
+}
+
 fn first_image(folder: &Path, camera: &str) -> String {
     let names = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().file_name().into_string().unwrap());
     names.filter(|name| name.starts_with(camera)).min().unwrap()
@@ -248,4 +257,37 @@ fn bench_prints_every_figure() {
     }
     assert_eq!(number(&layers[0], "forward_gflops"), 0.0, "scaling multiplies nothing");
     assert!(number(&result["profile"], "update_ms") > 0.0, "{result}");
+}
+
+#[test]
+fn a_sweep_of_latencies_says_where_a_driver_breaks_and_saves_table_chart_and_drives() {
+    let folder = tempfile::tempdir().unwrap();
+    let sweep = ["drive", "expert", "--track", "lake", "--runs", "1", "--latency-ms", "0,2000", "--against", "zero"];
+    let result = json(folder.path(), &[&sweep[..], &["--out", "sweep", "--json"]].concat());
+    assert_eq!(
+        (&result["driver"], &result["swept"], number(&result, "breaks_at")),
+        (&"expert".into(), &"latency_ms".into(), 2000.0)
+    );
+    let laps: Vec<f64> =
+        result["points"].as_array().unwrap().iter().map(|point| number(point, "laps_completed")).collect();
+    assert_eq!(laps, [1.0, 0.0]);
+    let one =
+        json(folder.path(), &["drive", "expert", "--track", "lake", "--runs", "1", "--latency-ms", "2000", "--json"]);
+    for key in ["cte_mean_m", "whiteness_deg_s", "interventions"] {
+        assert_eq!(one[key], result["points"][1][key], "{key}");
+    }
+    assert_eq!((&result["against"]["driver"], number(&result["against"], "breaks_at")), (&"zero".into(), 0.0));
+    let csv = std::fs::read_to_string(folder.path().join("sweep/sweep.csv")).unwrap();
+    assert_eq!(csv.lines().count(), 5, "{csv}");
+    for file in ["sweep.html", "0-ms/summary.json", "2000-ms/free_1.csv", "against-0-ms/summary.json"] {
+        assert!(folder.path().join("sweep").join(file).is_file(), "{file}");
+    }
+    for (arguments, message) in [
+        (&["--latency-ms", "0,50", "--noise", "0,0.1"][..], "not of both"),
+        (&["--noise", "0,0.1", "--watch"][..], "give one"),
+        (&["--latency-ms", "0,3000"][..], "3000"),
+    ] {
+        let refused = common::command::error(folder.path(), &[&sweep[..6], arguments].concat());
+        assert!(refused.contains(message), "{refused}");
+    }
 }

@@ -141,6 +141,7 @@ fn the_experiments_train_and_drive_every_variant() {
             recipe: lenet(1),
             seeds: 2,
             recordings: recordings.clone(),
+            said: Default::default(),
             tracks: scope.tracks.clone(),
             runs: 1,
             cache_mib: 64,

@@ -1,24 +1,23 @@
 //! Damaged and hostile files: whatever is in them, the answer is an error or a value, never a panic, and memory stays bounded.
 //!
-//! A mutation harness without a special toolchain: valid files of every format are damaged at random, from a seed, and read.
-//! It runs for some seconds; `STEERSMAN_FUZZ_SECONDS=300 cargo test --release --test hostile_files` runs longer, and
+//! Valid files of every format are damaged at random, from a seed, and read. It runs for some seconds; `STEERSMAN_FUZZ_SECONDS=300 cargo test --release --test hostile_files` runs longer, and
 //! `STEERSMAN_FUZZ_SEED=…` begins elsewhere. A failure names its seed, and repeats with it.
 
+mod common;
+
 use std::io::Write;
-use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
-use std::time::{Duration, Instant};
 
 use cap::Cap;
-use rand::{Rng, SeedableRng};
-use rand_chacha::ChaCha8Rng;
+use common::hammer::{Hammer, damage, damage_text, without_digest};
 use steersman::engine::tensor::Shape;
 use steersman::exchange::keras::{ImportOptions, import};
 use steersman::exchange::presets;
 use steersman::files::zip_archive::{ZipArchive, ZipEntry};
 use steersman::model_file::{Model, TrainingRecord};
 use steersman::recipe::Recipe;
+use steersman::simulator::Track;
 use steersman_kernels::Isa;
 
 /// Counts every allocation, and ends the process at the limit.
@@ -28,132 +27,14 @@ static MEMORY: Cap<std::alloc::System> = Cap::new(std::alloc::System, 1 << 30);
 /// Memory that a damaged file of about 100 KB may take.
 const MAX_BYTES: usize = 64 << 20;
 
+/// The harness.
+const HAMMER: Hammer = Hammer { memory: &MEMORY, max_bytes: MAX_BYTES };
+
 /// One test at a time, so that memory belongs to it.
 static ALONE: Mutex<()> = Mutex::new(());
 
 fn golden(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden/keras").join(name)
-}
-
-fn number<T: std::str::FromStr>(variable: &str, default: T) -> T {
-    std::env::var(variable).ok().map_or(default, |text| text.parse().unwrap_or_else(|_| panic!("{variable}={text}")))
-}
-
-/// Damages `bytes` in one to eight places.
-fn damage(random: &mut ChaCha8Rng, bytes: &mut Vec<u8>) {
-    let mut below = |bound: usize| (random.next_u64() % bound.max(1) as u64) as usize;
-    for _ in 0..=below(8) {
-        let at = below(bytes.len());
-        let end = (at + 1 + below(16)).min(bytes.len());
-        match below(9) {
-            0 => bytes[at..end].iter_mut().for_each(|byte| *byte = 0xff),
-            1 => bytes[at..end].iter_mut().for_each(|byte| *byte = 0),
-            2 => {
-                if let Some(byte) = bytes.get_mut(at) {
-                    *byte ^= 1 << below(8);
-                }
-            }
-            3 => {
-                if let Some(byte) = bytes.get_mut(at) {
-                    *byte = below(256) as u8;
-                }
-            }
-            4 => bytes.truncate(at),
-            5 => drop(bytes.drain(at..end)),
-            // A part of the file in another place: addresses that lead elsewhere, nested brackets.
-            6 => {
-                let part = bytes[at..end].to_vec();
-                let to = below(bytes.len());
-                bytes.splice(to..to, part);
-            }
-            7 => {
-                let part = bytes[at..end].to_vec();
-                let to = below(bytes.len().saturating_sub(part.len()));
-                for (byte, new) in bytes[to..].iter_mut().zip(part) {
-                    *byte = new;
-                }
-            }
-            // Numbers at the edge, as sizes and addresses.
-            _ => {
-                let edge = [0, 1, 0x7f, 0xffff, 0x7fff_ffff, 0xffff_ffff, 1 << 40, u64::MAX >> 1, bytes.len() as u64];
-                let value = edge[below(edge.len())].to_le_bytes();
-                for (byte, new) in bytes[at..].iter_mut().zip(value) {
-                    *byte = new;
-                }
-            }
-        }
-    }
-}
-
-/// Damages a number or a word of a text, so that it often stays well-formed.
-fn damage_text(random: &mut ChaCha8Rng, bytes: &mut Vec<u8>) {
-    let below = |random: &mut ChaCha8Rng, bound: usize| (random.next_u64() % bound.max(1) as u64) as usize;
-    if below(random, 3) == 0 {
-        return damage(random, bytes);
-    }
-    for _ in 0..=below(random, 4) {
-        let digits: Vec<usize> = (0..bytes.len()).filter(|i| bytes[*i].is_ascii_digit()).collect();
-        if digits.is_empty() {
-            return;
-        }
-        let at = digits[below(random, digits.len())];
-        let words = [
-            "0",
-            "-1",
-            "1e999",
-            "99999999999",
-            "4294967296",
-            "null",
-            "\"x\"",
-            "[]",
-            "{}",
-            "[[1,2],3]",
-            "0.5",
-            "true",
-            "65536",
-        ];
-        let word = words[below(random, words.len())].bytes();
-        bytes.splice(at..at + 1, word);
-    }
-}
-
-/// Reads damaged versions of `original` for `share` of the time, and reports what happened.
-fn hammer(
-    name: &str,
-    original: &[u8],
-    share: f64,
-    damage: impl Fn(&mut ChaCha8Rng, &mut Vec<u8>),
-    read: impl Fn(&[u8]) -> Result<(), String>,
-) {
-    let seconds = number("STEERSMAN_FUZZ_SECONDS", 4.0);
-    let end = Instant::now() + Duration::from_secs_f64(seconds * share);
-    let first = number("STEERSMAN_FUZZ_SEED", 1u64);
-    let (mut accepted, mut refused, mut most, mut slowest) = (0, 0, 0, Duration::ZERO);
-    read(original).unwrap_or_else(|e| panic!("{name}: the undamaged file is refused: {e}"));
-    for seed in first.. {
-        // A hundred at least, however slow the machine is.
-        if Instant::now() > end && seed >= first + 100 {
-            break;
-        }
-        let mut bytes = original.to_vec();
-        damage(&mut ChaCha8Rng::seed_from_u64(seed), &mut bytes);
-        let (before, started) = (MEMORY.allocated(), Instant::now());
-        MEMORY.set_limit(before + MAX_BYTES).expect("the limit is above what is in use");
-        let result = catch_unwind(AssertUnwindSafe(|| read(&bytes)));
-        MEMORY.set_limit(1 << 30).expect("the limit is above what is in use");
-        match result {
-            Ok(Ok(())) => accepted += 1,
-            Ok(Err(message)) => {
-                assert!(!message.is_empty() && message.len() < 100_000, "{name}, seed {seed}: {} bytes", message.len());
-                refused += 1;
-            }
-            Err(_) => panic!("{name}: panic with seed {seed}"),
-        }
-        most = most.max(bytes.len());
-        slowest = slowest.max(started.elapsed());
-    }
-    println!("{name}: {accepted} accepted, {refused} refused, slowest {slowest:.1?}, files up to {most} bytes");
-    assert!(refused > 0, "{name}: damage that is never noticed is no damage");
 }
 
 /// Writes `bytes` where a command would find them.
@@ -207,16 +88,16 @@ fn damaged_keras_files_are_refused() {
     let options = ImportOptions::default();
     for name in ["keras1.h5", "keras2.h5", "keras3.h5"] {
         let bytes = std::fs::read(golden(name)).unwrap();
-        hammer(name, &bytes, 0.15, damage, |bytes| import_bytes(folder.path(), bytes, &options));
+        HAMMER.strike(name, &bytes, 0.15, damage, |bytes: &Vec<u8>| import_bytes(folder.path(), bytes, &options));
     }
     let bytes = std::fs::read(golden("keras3.keras")).unwrap();
-    hammer("keras3.keras", &bytes, 0.05, damage, |bytes| import_bytes(folder.path(), bytes, &options));
+    HAMMER.strike("keras3.keras", &bytes, 0.05, damage, |bytes: &Vec<u8>| import_bytes(folder.path(), bytes, &options));
 
     let theano = ImportOptions { input: Some(Shape::new(3, 20, 28)), ..ImportOptions::default() };
     let json = std::fs::read(golden("keras1-theano.json")).unwrap();
     let weights = golden("keras1-theano-weights.h5");
     let path = folder.path().join("architecture.json");
-    hammer("an architecture in a string", &json, 0.05, damage_text, |bytes| {
+    HAMMER.strike("an architecture in a string", &json, 0.05, damage_text, |bytes: &Vec<u8>| {
         std::fs::write(&path, bytes).unwrap();
         let options = ImportOptions { architecture: Some(path.clone()), ..theano.clone() };
         import(&weights, &options).map(|_| ()).map_err(|e| e.to_string())
@@ -225,7 +106,7 @@ fn damaged_keras_files_are_refused() {
     let original = entries("keras3.keras");
     for (place, (name, bytes)) in original.iter().enumerate().filter(|(_, (name, _))| name != "metadata.json") {
         let damage = if name.ends_with("json") { damage_text } else { damage };
-        hammer(&format!("{name} in keras3.keras"), bytes, 0.15, damage, |bytes| {
+        HAMMER.strike(&format!("{name} in keras3.keras"), bytes, 0.15, damage, |bytes: &Vec<u8>| {
             let mut entries = original.clone();
             entries[place].1 = bytes.to_vec();
             import_bytes(folder.path(), &archive(&entries), &options)
@@ -246,13 +127,16 @@ fn damaged_files_of_our_own_are_refused() {
     let model = Model { recipe, parameters, record: TrainingRecord::default(), training_rows: vec![1, 2, 3] };
     model.save(&path).unwrap();
     let bytes = std::fs::read(&path).unwrap();
-    let load = |bytes: &[u8]| Model::load(&stored(folder.path(), bytes)).map(|_| ()).map_err(|e| e.to_string());
-    hammer("a model file", &bytes, 0.1, damage, load);
-    hammer(
-        "a model file's header",
+    let load = |bytes: &Vec<u8>| Model::load(&stored(folder.path(), bytes)).map(|_| ()).map_err(|e| e.to_string());
+    HAMMER.strike("a model file", &bytes, 0.1, damage, load);
+    // Files of earlier versions have no digest: damage comes as far as the tensors and the recipe.
+    let bytes = without_digest(&bytes);
+    HAMMER.strike("a model file without a digest", &bytes, 0.1, damage, load);
+    HAMMER.strike(
+        "the header of a model file",
         &bytes,
         0.1,
-        |random, bytes| {
+        |random, bytes: &mut Vec<u8>| {
             let tensors = bytes.split_off(8 + u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize);
             let mut header = bytes.split_off(8);
             damage_text(random, &mut header);
@@ -262,14 +146,19 @@ fn damaged_files_of_our_own_are_refused() {
     );
 
     let text = model.recipe.to_toml().unwrap();
-    hammer("a recipe", text.as_bytes(), 0.1, damage_text, |bytes| {
+    HAMMER.strike("a recipe", &text.into_bytes(), 0.1, damage_text, |bytes: &Vec<u8>| {
         let text = std::str::from_utf8(bytes).map_err(|e| e.to_string())?;
         Recipe::parse("damaged", text, &[]).map(|_| ()).map_err(|e| e.to_string())
+    });
+    let track = include_str!("../data/tracks/coast.toml").as_bytes().to_vec();
+    HAMMER.strike("a track file", &track, 0.1, damage_text, |bytes: &Vec<u8>| {
+        let text = std::str::from_utf8(bytes).map_err(|e| e.to_string())?;
+        Track::from_toml(text, "damaged").map(|_| ()).map_err(|e| e.to_string())
     });
     let toml = folder.path().join("p.toml");
     let name = toml.to_str().unwrap().to_string();
     let table = "source = [160, 320]\nrows = [40, 138]\nresize = [64, 64]\ninterpolation = 'area'\ncolour = 'hsv'\nscale = 0.5\n";
-    hammer("a preprocessing", table.as_bytes(), 0.05, damage_text, |bytes| {
+    HAMMER.strike("a preprocessing", &table.as_bytes().to_vec(), 0.05, damage_text, |bytes: &Vec<u8>| {
         std::fs::write(&toml, bytes).unwrap();
         presets::find(&name).map(|_| ()).map_err(|e| e.to_string())
     });

@@ -4,7 +4,7 @@
 use std::sync::{Mutex, PoisonError};
 
 use ndarray::{Array1, ArrayView1, ArrayView4, Axis};
-use steersman::engine::loss::Loss;
+use steersman::engine::loss::{Loss, PairTerms, Pairs, Smoothness};
 use steersman::engine::network::{InferencePlan, LayerSpec, Network, Parameters, Predictor, StepInput, TrainingPlan};
 use steersman::engine::optimizer::{AveragingSpec, Optimizer, WeightAverage};
 use steersman::engine::random::{Purpose, rng, uniform};
@@ -242,6 +242,66 @@ fn a_network_can_learn_eight_images_by_heart() {
 }
 
 /// Two networks of the same sizes, with another slope: all buffers would fit, so nothing but the plan itself can tell.
+/// A network with batch norm or without, whose loss is smooth: no dropout, no ReLU.
+fn smooth_network(batch_norm: bool) -> Network {
+    let norm = if batch_norm { "{kind='batch_norm'}, " } else { "" };
+    let layers = format!(
+        "layers=[{{kind='conv2d', filters=4, kernel=[3, 3], stride=[2, 2]}}, {norm}{{kind='tanh'}}, {{kind='flatten'}}, \
+         {{kind='dense', units=1}}]"
+    );
+    let overrides = [layers, "preprocessing.resize=[12, 14]".into()];
+    Recipe::find("lenet", &overrides).unwrap().network(Isa::best()).unwrap()
+}
+
+/// 37 images are no multiple of shards, pairs or groups.
+#[test]
+fn pairs_add_the_mean_of_their_squares_with_its_gradient_and_the_same_bits_for_any_number_of_threads() {
+    let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
+    let smoothness = Smoothness { pairs_share: 0.5, spatial: 2.0, temporal: 3.0 };
+    let terms = PairTerms::new(&smoothness, Pairs { spatial: 5, temporal: 6 });
+    for network in [smooth_network(false), smooth_network(true)] {
+        let mut random = rng(1, Purpose::Test, 0, 0);
+        let mut draw = |n: usize| -> Vec<f32> { (0..n).map(|_| uniform(&mut random, -1.0, 1.0) as f32).collect() };
+        let (x, labels) = (draw(37 * network.input().len()), draw(37));
+        let parameters = network.initialize(1);
+        let step = |parameters: &Parameters, terms: &PairTerms, threads: usize, capacity: usize| {
+            let input = StepInput { x: images(&network, &x), labels: ArrayView1::from(&labels), seed: 1, step: 0 };
+            let (mut plan, mut parameters) = (TrainingPlan::new(&network, capacity), parameters.clone());
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            let loss = Loss::default();
+            let value = pool.install(|| plan.step_with_pairs(&network, &mut parameters, &loss, terms, input));
+            (value, plan.gradient().to_vec())
+        };
+        let (value, gradient) = step(&parameters, &terms, 1, 64);
+        for (threads, capacity) in [(2, 64), (3, 96)] {
+            assert!(step(&parameters, &terms, threads, capacity) == (value, gradient.clone()), "{threads} threads");
+        }
+        let (plain, _) = step(&parameters, &PairTerms::default(), 2, 37);
+        if network.count(false) == 0 {
+            let mut y = Array1::zeros(37);
+            InferencePlan::new(&network, 37).run(&network, &parameters, images(&network, &x), y.view_mut());
+            let mean = |pairs: std::ops::Range<usize>| {
+                let error = |i: usize| f64::from(y[i]) - f64::from(labels[i]);
+                let square = |pair: usize| (error(2 * pair) - error(2 * pair + 1)).powi(2);
+                pairs.clone().map(square).sum::<f64>() / pairs.len() as f64
+            };
+            let expected = plain + 2.0 * mean(0..5) + 3.0 * mean(5..11);
+            approx::assert_relative_eq!(value, expected, max_relative = 1e-5);
+        }
+        assert!(value > 1.5 * plain, "the terms count: {value}, {plain}");
+        // Along the gradient the loss rises by its squared length.
+        let along = |by: f32| {
+            let mut moved = parameters.clone();
+            moved.values.iter_mut().zip(&gradient).for_each(|(value, slope)| *value += by * slope);
+            step(&moved, &terms, 2, 64).0
+        };
+        let square: f64 = gradient.iter().map(|g| f64::from(*g).powi(2)).sum();
+        let h = 1e-2 / square.sqrt();
+        let slope = (along(h as f32) - along(-h as f32)) / (2.0 * h);
+        approx::assert_relative_eq!(slope, square, max_relative = 5e-3);
+    }
+}
+
 /// With batch norm behind several layers (`hyper`), and none at all (`lenet`).
 #[test]
 fn a_pass_for_statistics_alone_moves_them_as_a_step_does_and_nothing_else() {

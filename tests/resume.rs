@@ -78,14 +78,15 @@ fn a_killed_run_goes_on_to_the_same_bits() {
     assert_same_result(folder.path(), "killed", &whole);
 }
 
-/// An average whose running statistics are fitted anew, and one whose statistics are averaged.
+/// An average whose running statistics are fitted anew, and one whose statistics are averaged; batches hold pairs.
 #[test]
 fn a_killed_run_goes_on_to_the_same_averaged_weights() {
     let folder = tempfile::tempdir().unwrap();
     painted_log::write(&folder.path().join("log"), 400, "");
     let layers = "layers=[{kind='conv2d', filters=4, kernel=[3, 3], stride=[2, 2]}, {kind='batch_norm'}, {kind='relu'}, \
                   {kind='flatten'}, {kind='dense', units=1}]";
-    let of = |averaging| [&ARGS[..], &["--set", layers, "--set", averaging]].concat();
+    let pairs = "smoothness={pairs_share=1.0, spatial=1.0, temporal=1.0}";
+    let of = |averaging| [&ARGS[..], &["--set", layers, "--set", averaging, "--set", pairs]].concat();
     let mut hashes = Vec::new();
     for averaging in ["averaging={kind='ema', decay=0.99, refit_batches=5}", "averaging={kind='swa', from_share=0.3}"] {
         let args = of(averaging);
@@ -172,4 +173,57 @@ fn a_run_whose_recording_has_changed_does_not_go_on() {
     fs::write(&log, text.lines().take(150).collect::<Vec<_>>().join("\n")).unwrap();
     let message = common::command::error(folder.path(), &["train", "--resume", "run"]);
     assert!(message.contains("the recordings have changed since the run began"), "{message}");
+}
+
+#[test]
+fn a_run_goes_on_only_with_the_same_pictures() {
+    let folder = tempfile::tempdir().unwrap();
+    painted_log::write(&folder.path().join("log"), 400, "");
+    let whole = uninterrupted(folder.path());
+    let mut child = start(folder.path(), "run");
+    wait_for_second_epoch(folder.path(), "run");
+    child.kill().unwrap();
+    child.wait().unwrap();
+    assert!(!folder.path().join("run/result.json").exists(), "it was finished before it could be killed");
+    // One picture of the centre camera becomes another one; names and labels stay.
+    let images = folder.path().join("log/IMG");
+    let names = fs::read_dir(&images).unwrap().map(|entry| entry.unwrap().path());
+    let mut centre: Vec<_> = names.filter(|path| path.display().to_string().contains("center")).collect();
+    centre.sort();
+    let [first, second] = [&centre[0], &centre[1]].map(|path| fs::read(path).unwrap());
+    fs::write(&centre[0], &second).unwrap();
+    let message = common::command::error(folder.path(), &["train", "--resume", "run"]);
+    assert!(message.contains("pictures of the recordings have changed since the run began"), "{message}");
+    fs::write(&centre[0], first).unwrap();
+    assert_same_result(folder.path(), "run", &whole);
+}
+
+#[test]
+fn a_run_whose_recordings_were_moved_goes_on_where_they_are_now() {
+    let folder = tempfile::tempdir().unwrap();
+    let dir = folder.path();
+    painted_log::write(&dir.join("log"), 400, "");
+    let whole = uninterrupted(dir);
+    let mut child = start(dir, "run");
+    wait_for_second_epoch(dir, "run");
+    child.kill().unwrap();
+    child.wait().unwrap();
+    assert!(!dir.join("run/result.json").exists(), "it was finished before it could be killed");
+    fs::rename(dir.join("log"), dir.join("elsewhere")).unwrap();
+    let message = common::command::error(dir, &["train", "--resume", "run"]);
+    assert!(
+        message.contains("log: the recording is not there any more") && message.contains("--recordings"),
+        "{message}"
+    );
+    let message = common::command::error(dir, &["train", "--resume", "run", "--recordings", "elsewhere", "elsewhere"]);
+    assert!(message.contains("the run has 1 recordings, --recordings names 2"), "{message}");
+    // Another recording is no substitute.
+    painted_log::write(&dir.join("other"), 300, "_b");
+    let message = common::command::error(dir, &["train", "--resume", "run", "--recordings", "other"]);
+    assert!(message.contains("the recordings have changed since the run began"), "{message}");
+    let resumed = json(dir, &["train", "--resume", "run", "--recordings", "elsewhere", "--json"]);
+    assert_eq!(resumed["weights_hash"], whole["weights_hash"]);
+    // From now on it knows where they are.
+    let info: serde_json::Value = serde_json::from_slice(&fs::read(dir.join("run/run.json")).unwrap()).unwrap();
+    assert!(info["recordings"][0].as_str().unwrap().ends_with("elsewhere"), "{info}");
 }

@@ -12,8 +12,10 @@ use std::net::TcpStream;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
+use common::hammer::{damage, damage_text};
 use common::served::{Served, command, random_model, sample_jpeg, telemetry};
-use rand::Rng;
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
 use steersman::engine::random::{Purpose, below, rng};
 
 /// The request of Udacity's simulator.
@@ -67,7 +69,7 @@ fn random_bytes(rng: &mut impl Rng, most: usize) -> Vec<u8> {
 /// Attacks, one after the other, each once in a while. `None` when the server did not want to hear the rest.
 type Kind = (&'static str, fn(u16, u64) -> Option<()>);
 
-const KINDS: [Kind; 8] = [
+const KINDS: [Kind; 10] = [
     ("random bytes", |port, turn| {
         let mut rng = rng(1, Purpose::Test, 0, turn);
         let mut attack = Attack::begin(port)?;
@@ -172,6 +174,33 @@ const KINDS: [Kind; 8] = [
         attack.say_text(&telemetry(10.0, &jpeg))?;
         attack.listen();
         attack.say_text(&telemetry(10.0, b"").replace("\"image\":\"", "\"image\":\"!!!"))?;
+        attack.listen();
+        Some(())
+    }),
+    ("messages damaged field by field", |port, turn| {
+        let mut attack = Attack::open(port)?;
+        let valid = [
+            telemetry(10.0, &sample_jpeg()),
+            "42[\"telemetry\",null]".to_string(),
+            "0{\"sid\":\"x\",\"pingInterval\":25000}".to_string(),
+            "40/,{\"a\":[1,2,{}]}".to_string(),
+            "2probe".to_string(),
+        ];
+        for k in 0..6 {
+            let mut bytes = valid[(turn as usize + k) % valid.len()].clone().into_bytes();
+            damage_text(&mut ChaCha8Rng::seed_from_u64(6 * turn + k as u64), &mut bytes);
+            attack.say_text(&String::from_utf8_lossy(&bytes))?;
+            attack.listen();
+        }
+        Some(())
+    }),
+    ("frames damaged bit by bit", |port, turn| {
+        let mut attack = Attack::open(port)?;
+        let text = telemetry(10.0, &sample_jpeg()[..2000]);
+        let mut frame = [&[0x81, 0xfe], &(text.len() as u16).to_be_bytes()[..], &[0; 4], text.as_bytes()].concat();
+        damage(&mut ChaCha8Rng::seed_from_u64(turn), &mut frame);
+        attack.say(&frame)?;
+        attack.listen();
         attack.listen();
         Some(())
     }),

@@ -6,13 +6,17 @@
 
 mod common;
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use common::command::json;
+use common::painted_log;
 use serde_json::Value;
+use steersman::dataset::Description;
 use steersman::engine::network::Parameters;
 use steersman::model_file::Model;
-use steersman::training::{EpochRecord, read_history};
+use steersman::observer::StopSignal;
+use steersman::recipe::Recipe;
+use steersman::training::{self, EpochRecord, TrainRequest, TrainResult, TrainingEvent, read_history};
 
 const LINEAR: &str = "layers=[{kind='scale', factor=0.004, offset=-0.5}, {kind='flatten'}, {kind='dense', units=1}]";
 const BATCH: u64 = 8;
@@ -117,6 +121,80 @@ fn the_mean_absolute_error_is_in_degrees_of_the_front_wheels() {
         approx::assert_relative_eq!(history[0].val_mae_deg.unwrap(), expected, max_relative = 1e-5);
         approx::assert_relative_eq!(result["relative_to_zero"].as_f64().unwrap(), 1.0, max_relative = 1e-5);
     }
+}
+
+/// A run on `log` that keeps no decoded image, with what it told; `at_batch` is called before batch 2 is trained on.
+fn watched(log: &Path, out: &Path, at_batch: &dyn Fn()) -> (steersman::Result<TrainResult>, Vec<TrainingEvent>) {
+    let settings = [LINEAR, "preprocessing.resize=[16, 16]", "batch=8", "epochs=2"].map(String::from);
+    let request = TrainRequest {
+        recordings: vec![log.to_path_buf()],
+        said: Description::default(),
+        recipe: Recipe::find("lenet", &settings).unwrap(),
+        out: out.to_path_buf(),
+        seed: 5,
+        cache_mib: 1,
+        from: None,
+        algorithm: None,
+        profile: false,
+    };
+    let (mut events, mut batches) = (Vec::new(), 0);
+    let mut observer = |event: TrainingEvent| {
+        if let TrainingEvent::Batch { .. } = event {
+            batches += 1;
+            if batches == 1 {
+                at_batch();
+            }
+        }
+        events.push(event);
+        Ok(())
+    };
+    let result = training::train(request, &mut observer, &StopSignal::default());
+    (result, events)
+}
+
+/// All pictures of a painted log, sorted.
+fn pictures(folder: &Path) -> Vec<PathBuf> {
+    let mut paths: Vec<PathBuf> =
+        std::fs::read_dir(folder.join("IMG")).unwrap().map(|entry| entry.unwrap().path()).collect();
+    paths.sort();
+    paths
+}
+
+#[test]
+fn a_recording_that_decays_while_it_is_trained_on_ends_the_run_and_keeps_the_checkpoint() {
+    let folder = tempfile::tempdir().unwrap();
+    let (log, run) = (folder.path().join("log"), folder.path().join("run"));
+    painted_log::write(&log, 300, "");
+    let truncate = || pictures(&log).iter().step_by(2).for_each(|path| std::fs::write(path, b"\xff\xd8\xff").unwrap());
+    let (result, _) = watched(&log, &run, &truncate);
+    let message = result.unwrap_err().to_string();
+    assert!(message.contains("more than a fifth is too much") && message.contains("--resume"), "{message}");
+    assert!(message.contains("IMG/") && message.contains("the JPEG is truncated"), "{message}");
+    assert!(run.join("checkpoint.safetensors").is_file() && !run.join("result.json").exists());
+}
+
+#[test]
+fn figures_of_a_run_count_the_images_that_were_used() {
+    let folder = tempfile::tempdir().unwrap();
+    let log = folder.path().join("log");
+    painted_log::write(&log, 300, "");
+    let (whole, _) = watched(&log, &folder.path().join("whole"), &|| {});
+    let whole = whole.unwrap();
+    let vanish = || pictures(&log).iter().step_by(12).for_each(|path| std::fs::remove_file(path).unwrap());
+    let (result, events) = watched(&log, &folder.path().join("run"), &vanish);
+    let result = result.unwrap();
+    assert!(result.train_images < whole.train_images, "{result:?}");
+    // In the second epoch every image is known to be readable or not.
+    let epochs: Vec<&EpochRecord> = events
+        .iter()
+        .filter_map(|event| if let TrainingEvent::Epoch { record, .. } = event { Some(record) } else { None })
+        .collect();
+    assert_eq!(epochs[1].images, result.train_images);
+    let lost = whole.train_images - result.train_images;
+    let told = format!("{lost} images cannot be decoded and are left out: ");
+    let told = |event: &TrainingEvent| matches!(event, TrainingEvent::Notice(text) if text.starts_with(&told));
+    assert!(events.iter().any(told), "{lost} lost: {events:?}");
+    assert!(result.val_images < whole.val_images && result.val_images > 0, "{result:?}");
 }
 
 /// One update an epoch: the weights after each update are those of a shorter run.

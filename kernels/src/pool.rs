@@ -38,7 +38,7 @@ impl PoolShape {
     }
 
     /// Checks the lengths of a batch of inputs and one of outputs.
-    fn check(&self, kernel: &str, n: usize, x_len: usize, y_len: usize) {
+    pub(crate) fn check(&self, kernel: &str, n: usize, x_len: usize, y_len: usize) {
         assert!(self.kh > 0 && self.kw > 0 && self.stride_h > 0 && self.stride_w > 0, "{kernel}: {self:?} has a 0");
         assert_eq!(x_len, n * self.c * self.h * self.w, "{kernel}: input length for {n} of {self:?}");
         assert_eq!(y_len, n * self.c * self.out_h() * self.out_w(), "{kernel}: output length for {n} of {self:?}");

@@ -133,6 +133,28 @@ pub fn average_backward(s: &PoolShape, n: usize, dy: &[f32], dx: &mut [f32]) {
     for_each_window(s, n, |window, o| window.iter().for_each(|&i| dx[i] += dy[o] / window.len() as f32));
 }
 
+/// Weight of place `k` of a window of a blur: the product of two binomial coefficients over the sum of all.
+fn blur_weight(s: &PoolShape, k: usize) -> f64 {
+    let choose = |n: usize, k: usize| (0..k).fold(1.0, |c, i| c * (n - i) as f64 / (i + 1) as f64);
+    let along = |taps: usize, k: usize| choose(taps - 1, k) / 2f64.powi(taps as i32 - 1);
+    along(s.kh, k / s.kw) * along(s.kw, k % s.kw)
+}
+
+/// See [`crate::blur::blur_forward`].
+pub fn blur_forward(s: &PoolShape, n: usize, x: &[f32], y: &mut [f32]) {
+    for_each_window(s, n, |window, o| {
+        y[o] = window.iter().enumerate().map(|(k, &i)| blur_weight(s, k) * f64::from(x[i])).sum::<f64>() as f32;
+    });
+}
+
+/// See [`crate::blur::blur_backward`].
+pub fn blur_backward(s: &PoolShape, n: usize, dy: &[f32], dx: &mut [f32]) {
+    dx.fill(0.0);
+    for_each_window(s, n, |window, o| {
+        window.iter().enumerate().for_each(|(k, &i)| dx[i] += (blur_weight(s, k) * f64::from(dy[o])) as f32);
+    });
+}
+
 /// See [`crate::activation::relu_forward`].
 pub fn relu_forward(x: &[f32], y: &mut [f32]) {
     for i in 0..x.len() {

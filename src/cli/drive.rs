@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use serde::Serialize;
 
+use super::drive_sweep;
 use super::recording_args::RecordingArgs;
 use super::replay::{self, ReplayArgs};
 use super::share_bar::ShareBar;
@@ -18,6 +19,7 @@ use crate::live::{DEFAULT_PORT, Hello, Live, Watch};
 use crate::observer::StopSignal;
 use crate::pilot::Pilot;
 use crate::report::charts::map;
+use crate::report::pages::sweep::Swept;
 use crate::report::video::drive::DriveVideo;
 use crate::report::video::onlooker::Onlooker;
 use crate::report::video::painter::Captions;
@@ -32,7 +34,7 @@ use crate::simulator::{
 #[derive(Debug, Args)]
 pub struct DriveArgs {
     /// Model file, or `expert`, or `zero` (never steers)
-    model: String,
+    pub(super) model: String,
     /// lake, mountain, coast, forest, random:SEED, or a track file
     #[arg(long, required_unless_present = "on")]
     track: Option<String>,
@@ -52,22 +54,22 @@ pub struct DriveArgs {
     speed: Speed,
     /// Runs, each with a seed of its own, counted from --seed
     #[arg(long, default_value_t = 10)]
-    runs: usize,
+    pub(super) runs: usize,
     /// First seed; a seed draws start, direction, light, texture and noise
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Time from a picture to the wheels, ms
-    #[arg(long, default_value_t = 0.0, value_name = "MS")]
-    latency_ms: f64,
-    /// Standard deviation of a disturbance of the steering
-    #[arg(long, default_value_t = 0.0)]
-    noise: f64,
+    /// Time from a picture to the wheels, ms; of several, as in 0,50,100,150,200, each is driven, and it is said where it breaks
+    #[arg(long, default_value = "0", value_name = "MS,…", value_delimiter = ',')]
+    latency_ms: Vec<f64>,
+    /// Standard deviation of a disturbance of the steering; several are driven like several latencies
+    #[arg(long, default_value = "0", value_name = "SHARE,…", value_delimiter = ',')]
+    noise: Vec<f64>,
     /// A second model, `expert` or `zero`: drives the same seeds, and the difference is tested
     #[arg(long, value_name = "MODEL")]
-    against: Option<String>,
+    pub(super) against: Option<String>,
     /// Save the trajectories as csv files, and a map of them; the folder must not exist
     #[arg(long, value_name = "DIR")]
-    out: Option<PathBuf>,
+    pub(super) out: Option<PathBuf>,
     /// Show the runs, one after the other and in real time, on a page in a browser of this machine
     #[arg(long)]
     watch: bool,
@@ -85,10 +87,10 @@ pub struct DriveArgs {
     fps: Option<f64>,
     /// Threads; 0 is one for each core
     #[arg(long, default_value_t = 0)]
-    threads: usize,
+    pub(super) threads: usize,
     /// Print one JSON object as the last line
     #[arg(long)]
-    json: bool,
+    pub(super) json: bool,
 }
 
 /// What `drive --json` prints.
@@ -105,6 +107,19 @@ struct Report<'a> {
 }
 
 pub fn run(args: DriveArgs) -> Result<()> {
+    let (latency_ms, noise) = (first(&args.latency_ms), first(&args.noise));
+    let swept = match (args.latency_ms.len() > 1, args.noise.len() > 1) {
+        (false, false) => None,
+        (true, false) => Some((Swept::LatencyMs, &args.latency_ms)),
+        (false, true) => Some((Swept::Noise, &args.noise)),
+        (true, true) => {
+            return Err(Error::Usage("several values of --latency-ms or of --noise are driven, not of both".into()));
+        }
+    };
+    if swept.is_some() && (args.on.is_some() || args.watch || args.video.is_some()) {
+        let message = "several values of --latency-ms or --noise do not go with --on, --watch or --video: give one";
+        return Err(Error::Usage(message.into()));
+    }
     let track = match (&args.on, &args.track) {
         (None, Some(track)) => Track::load(track)?,
         (None, None) => return Err(Error::Usage("name a track with --track, or a recording with --on".into())),
@@ -116,20 +131,17 @@ pub fn run(args: DriveArgs) -> Result<()> {
                 against: args.against.as_deref(),
                 out: args.out.as_deref(),
                 camera: args.camera.as_deref(),
-                latency_ms: args.latency_ms,
+                latency_ms,
                 threads: args.threads,
                 json: args.json,
             });
         }
     };
-    let options = DriveOptions {
-        laps: args.laps,
-        runs: args.runs,
-        seed: args.seed,
-        speed: args.speed,
-        latency_ms: args.latency_ms,
-        noise: args.noise,
-    };
+    let options =
+        DriveOptions { laps: args.laps, runs: args.runs, seed: args.seed, speed: args.speed, latency_ms, noise };
+    if let Some((swept, values)) = swept {
+        return drive_sweep::run(&args, &track, &options, swept, values);
+    }
     let at_wheel = Wheel::find(&args.model)?;
     let against = args.against.as_deref().map(Wheel::find).transpose()?;
     // What cannot be created is told before minutes are spent.
@@ -191,6 +203,11 @@ pub fn run(args: DriveArgs) -> Result<()> {
     saved.and(video.map_or(Ok(()), film))
 }
 
+/// The first of the values of an option, which has at least one.
+fn first(values: &[f64]) -> f64 {
+    values.first().copied().unwrap_or_default()
+}
+
 /// `20` or `auto`.
 fn speed(text: &str) -> Result<Speed, String> {
     match text.parse() {
@@ -201,14 +218,14 @@ fn speed(text: &str) -> Result<Speed, String> {
 }
 
 /// Who steers.
-enum Wheel {
+pub(super) enum Wheel {
     Expert,
     Zero,
     Model(Box<Pilot>),
 }
 
 impl Wheel {
-    fn find(name: &str) -> Result<Wheel> {
+    pub(super) fn find(name: &str) -> Result<Wheel> {
         Ok(match name {
             "expert" => Wheel::Expert,
             "zero" => Wheel::Zero,
@@ -262,7 +279,7 @@ impl Wheel {
         if stopped { Err(Error::Interrupted) } else { Ok(()) }
     }
 
-    fn drive(
+    pub(super) fn drive(
         &self,
         track: &Track,
         options: &DriveOptions,
@@ -302,7 +319,7 @@ fn summary_text(model: &str, s: &DriveSummary) -> String {
          off the road               {:.1} s\n\
          crashes                    {}\n\
          mean speed                 {:.1} mph\n\
-         whiteness                  {:.1} deg/s (expert {:.1})\n\
+         whiteness                  {:.1} deg/s (expert {:.1})\n{}\
          real-time factor           {:.1}\n",
         s.track,
         s.runs,
@@ -320,6 +337,23 @@ fn summary_text(model: &str, s: &DriveSummary) -> String {
         s.mean_speed_mph,
         s.whiteness_deg_s,
         s.expert_whiteness_deg_s,
+        calm_text(s),
         s.realtime_factor
+    )
+}
+
+/// The measures of calm beside the expert's, a line each.
+fn calm_text(s: &DriveSummary) -> String {
+    let (Some(calm), Some(expert)) = (&s.calm, &s.expert_calm) else { return String::new() };
+    format!(
+        "wheel reversals            {:.1} a minute (expert {:.1})\n\
+         angle's change, 95 %       {:.2} deg a frame (expert {:.2})\n\
+         lateral jerk, RMS          {:.1} m/s³ (expert {:.1})\n",
+        calm.reversals_per_min,
+        expert.reversals_per_min,
+        calm.angle_change_p95_deg,
+        expert.angle_change_p95_deg,
+        calm.lateral_jerk_rms_mps3,
+        expert.lateral_jerk_rms_mps3
     )
 }

@@ -1,10 +1,11 @@
-//! `steersman experiment`: the two experiments of the write-ups, each to the end of the road.
+//! `steersman experiment`: the two experiments of the write-ups and what makes the wheel calm, each to the end of the road.
 
 use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
 
 use super::progress::JobDisplay;
+use super::recording_args::RecordingArgs;
 use super::{RecipeArgs, or_dash, pool, print_json, refuse_existing, stop_on_ctrl_c};
 use crate::dataset::held_out::{self, trained_on_held_out};
 use crate::error::{Error, Result};
@@ -14,7 +15,7 @@ use crate::main_job::training_set::RANDOM_TRACKS;
 use crate::observer::Observer;
 use crate::simulator::Track;
 
-/// Compare splits or colour spaces: what the validation loss promises beside what the drive delivers
+/// Compare splits, colour spaces or what makes the wheel calm: what the validation loss promises beside what the drive delivers
 #[derive(Debug, Args)]
 pub struct ExperimentArgs {
     /// What is varied
@@ -37,6 +38,8 @@ pub struct ExperimentArgs {
     /// Train on these recordings instead of the simulator's
     #[arg(long = "recording", value_name = "RECORDING")]
     recordings: Vec<PathBuf>,
+    #[command(flatten)]
+    reading: RecordingArgs,
     /// Train on recordings of held-out tracks all the same
     #[arg(long, requires = "recordings")]
     force_held_out: bool,
@@ -63,13 +66,16 @@ enum SubjectArg {
     Split,
     /// RGB, YUV, HSV, the saturation alone, grey
     Colour,
+    /// Averaged weights, terms of smoothness, blur before strides: what makes the wheel calm
+    Smooth,
 }
 
 pub fn run(args: ExperimentArgs) -> Result<()> {
     if args.runs == 0 {
         return Err(Error::Usage("--runs 0: at least 1 run is needed".into()));
     }
-    let held_out = held_out::check(&args.recordings, args.force_held_out)?;
+    let given = args.reading.expand(args.recordings)?;
+    let held_out = held_out::check(&given, args.force_held_out)?;
     if !held_out.is_empty() {
         eprintln!("note: {}", trained_on_held_out(&held_out));
     }
@@ -90,19 +96,29 @@ pub fn run(args: ExperimentArgs) -> Result<()> {
     let (pool, mut display) = (pool(args.threads)?, JobDisplay::new(&stop));
     // A file that cannot be written is told before hours are spent.
     let out = new_csv(args.out, args.subject)?;
-    let recordings = match args.recordings.is_empty() {
+    let recordings = match given.is_empty() {
         true => {
             let takes = takes(args.random_tracks as usize);
             pool.install(|| training_set(RECORDINGS.as_ref(), &takes, &mut display, &stop))
         }
-        false => Ok(args.recordings),
+        false => Ok(given),
     };
     let recordings = recordings.inspect_err(|_| drop(std::fs::remove_file(&out)))?;
     let subject = match args.subject {
         SubjectArg::Split => Subject::Split,
         SubjectArg::Colour => Subject::Colour,
+        SubjectArg::Smooth => Subject::Smooth,
     };
-    let plan = ExperimentPlan { subject, recipe, seeds, recordings, tracks, runs, cache_mib: args.cache };
+    let plan = ExperimentPlan {
+        subject,
+        recipe,
+        seeds,
+        recordings,
+        said: args.reading.said(),
+        tracks,
+        runs,
+        cache_mib: args.cache,
+    };
     let mut done = Vec::new();
     let mut observer = |event| match event {
         ExperimentEvent::Job(event) => display.observe(event),
@@ -138,6 +154,7 @@ fn new_csv(out: Option<PathBuf>, subject: SubjectArg) -> Result<PathBuf> {
     let name = match subject {
         SubjectArg::Split => "split",
         SubjectArg::Colour => "colour",
+        SubjectArg::Smooth => "smooth",
     };
     let of_number = |n: u32| PathBuf::from(format!("runs/experiment-{name}-{n}.csv"));
     let out = out.unwrap_or_else(|| (1..).map(of_number).find(|path| !path.exists()).expect("numbers go on"));
@@ -183,6 +200,25 @@ fn print_table(plan: &ExperimentPlan, trials: &[ExperimentRow]) {
             mean(&|t| t.autonomy_percent),
             mean(&|t| t.cte_mean_m),
         );
+    }
+    if plan.subject == Subject::Smooth {
+        println!("variant         whiteness (worst)        reversals        change a frame, 95 %     lateral jerk");
+        let mut variants: Vec<&str> = trials.iter().map(|trial| trial.variant.as_str()).collect();
+        variants.dedup();
+        for variant in variants {
+            let of: Vec<&ExperimentRow> = trials.iter().filter(|trial| trial.variant == variant).collect();
+            let mean = |f: &dyn Fn(&ExperimentRow) -> f64| of.iter().map(|t| f(t)).sum::<f64>() / of.len() as f64;
+            println!(
+                "{variant:<13} {:>5.1} deg/s ({:.1}) {:>12.1} a minute {:>16.2} deg {:>14.1} m/s³",
+                mean(&|t| t.whiteness_deg_s),
+                of.iter().map(|t| t.worst_whiteness_deg_s).fold(0.0, f64::max),
+                mean(&|t| t.reversals_per_min),
+                mean(&|t| t.angle_change_p95_deg),
+                mean(&|t| t.lateral_jerk_rms_mps3),
+            );
+        }
+        let expert = trials.iter().map(|t| t.expert_whiteness_deg_s).sum::<f64>() / trials.len() as f64;
+        println!("the expert's whiteness there is {expert:.1} deg/s; the worst is that of a track and a training");
     }
     println!(
         "means over the trainings; in brackets the least and most. leak: validation frames with a training frame of the same\n\

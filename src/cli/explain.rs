@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 use serde::Serialize;
 
+use super::recording_args::RecordingArgs;
 use super::share_bar::ShareBar;
 use super::{load_pilot, new_folder, pool, print, print_json, refuse_existing, stop_on_ctrl_c};
 use crate::error::{Error, Result};
@@ -21,9 +22,11 @@ use crate::report::tone::Tone;
 pub struct ExplainArgs {
     /// Model file
     model: PathBuf,
-    /// Images, or recordings
+    /// Images, or recordings: folders, logs, or .zip and .tar.gz archives of them
     #[arg(value_name = "IMAGE|RECORDING", required_unless_present = "track", conflicts_with = "track")]
     inputs: Vec<PathBuf>,
+    #[command(flatten)]
+    reading: RecordingArgs,
     /// Look at what the simulator's expert sees on a lap: lake, mountain, coast, forest, random:SEED, or a track file
     #[arg(long)]
     track: Option<String>,
@@ -54,7 +57,7 @@ pub fn run(args: ExplainArgs) -> Result<()> {
     refuse_existing(&args.out)?;
     let footage = match &args.track {
         Some(track) => Footage::of_track(track, args.seed)?,
-        None => Footage::of_paths(&args.inputs)?,
+        None => Footage::of_paths(&args.reading.expand_recordings(&args.inputs)?, &args.reading.said())?,
     };
     let stop = stop_on_ctrl_c()?;
     let mut bar = ShareBar::new("changing pictures", &stop);

@@ -7,8 +7,8 @@ use clap::Args;
 use serde::Serialize;
 use steersman_kernels::Isa;
 
+use super::recording_args::RecordingArgs;
 use super::{or_dash, pool, print, print_json};
-use crate::dataset;
 use crate::dataset::colour::Colour;
 use crate::dataset::preprocess::Preprocessing;
 use crate::dataset::resize::Interpolation;
@@ -35,6 +35,8 @@ pub struct ImportArgs {
     /// Try the plausible preprocessings on a recording and rank them; without --preprocessing, --out takes the best
     #[arg(long, value_name = "RECORDING")]
     fit: Option<PathBuf>,
+    #[command(flatten)]
+    reading: RecordingArgs,
     /// A Lambda layer computes x / A - B, where its byte code does not say so
     #[arg(long = "lambda", value_name = "LAYER=A,B", value_parser = parse_lambda, allow_hyphen_values = true)]
     lambdas: Vec<(String, (f64, f64))>,
@@ -113,7 +115,7 @@ pub fn run(args: ImportArgs) -> Result<()> {
     let ranking = match &args.fit {
         Some(recording) => {
             let pool = pool(args.threads)?;
-            let recording = pool.install(|| dataset::load(recording))?;
+            let recording = pool.install(|| args.reading.load(recording))?;
             let frames = pool.install(|| Frames::of(&recording))?;
             let count = fit::combinations(&network).len();
             eprintln!("trying {count} combinations on up to {} frames of {}", frames.len(), recording.path.display());

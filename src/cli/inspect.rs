@@ -8,8 +8,8 @@ use serde::Serialize;
 use super::fit_camera;
 use super::recording_args::RecordingArgs;
 use super::share_bar::ShareBar;
-use super::{RecipeArgs, new_folder, pool, print, print_json, refuse_existing, stop_on_ctrl_c};
-use crate::dataset::inspect::{Report, inspect};
+use super::{RecipeArgs, end_with, new_folder, pool, print, print_json, refuse_existing, stop_on_ctrl_c};
+use crate::dataset::inspect::{Report, Treatment, inspect};
 use crate::error::{Error, Result};
 use crate::files::atomic_file;
 use crate::report::pages::inspection;
@@ -50,17 +50,18 @@ enum Answer {
 }
 
 pub fn run(args: InspectArgs) -> Result<()> {
-    let recipe = args.recipe.find()?;
+    let recipe = args.recipe.find_or("recording")?;
     args.out.as_deref().map_or(Ok(()), refuse_existing)?;
     let (pool, stop) = (pool(args.threads)?, stop_on_ctrl_c()?);
     if args.fit_camera {
         return pool.install(|| fit_camera::run(&args.recordings, &args.reading));
     }
     let said = args.reading.said();
+    let treatment = Treatment { samples: recipe.samples.clone(), balance: recipe.balance.clone() };
     let (mut inspections, mut reports, mut failed) = (Vec::new(), Vec::new(), Vec::new());
     for path in &args.reading.expand(args.recordings)? {
         let mut bar = ShareBar::new(format!("looking at {}", path.display()), &stop);
-        let inspection = pool.install(|| inspect(path, &said, &mut bar));
+        let inspection = pool.install(|| inspect(path, &said, &treatment, &mut bar));
         drop(bar);
         let inspection = match inspection {
             Ok(inspection) => inspection,
@@ -94,8 +95,5 @@ pub fn run(args: InspectArgs) -> Result<()> {
     if args.json {
         print_json(&reports)?;
     }
-    // The last one ends the command, those before it are told.
-    let last = failed.pop();
-    failed.iter().for_each(|error| eprintln!("error: {error}"));
-    last.map_or(Ok(()), Err)
+    end_with(failed)
 }

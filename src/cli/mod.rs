@@ -18,6 +18,7 @@ macro_rules! eprintln {
 mod bench;
 mod compare;
 mod drive;
+mod drive_sweep;
 mod evaluate;
 mod experiment;
 mod explain;
@@ -25,6 +26,7 @@ mod export;
 mod fit_camera;
 mod import;
 mod inspect;
+mod model_arg;
 mod predict;
 mod progress;
 mod record;
@@ -40,12 +42,13 @@ mod train;
 mod video;
 mod words;
 
-use std::io::{ErrorKind, IsTerminal, Write};
+use std::io::{self, IsTerminal, Write};
 use std::path::Path;
 use std::process::ExitCode;
 use std::time::Instant;
 
-use clap::{Args, Parser, Subcommand};
+use clap::error::{ContextKind, ContextValue, ErrorKind};
+use clap::{Args, CommandFactory, Parser, Subcommand};
 use serde::Serialize;
 
 use crate::error::{Error, Result};
@@ -53,8 +56,8 @@ use crate::model_file::{Model, notice_without_digest};
 use crate::observer::StopSignal;
 use crate::pilot::Pilot;
 use crate::recipe::Recipe;
-use crate::text::escaped;
-use crate::text::{escaped_json, escaped_lines};
+use crate::text::{escaped, escaped_json, escaped_lines};
+use model_arg::model_file;
 
 /// Learn to steer a car from its front camera, and drive with what was learned.
 #[derive(Debug, Parser)]
@@ -171,17 +174,41 @@ pub fn main() -> ExitCode {
 /// Prints what clap has to say: help, the version, or what is wrong with the arguments, which may be names of foreign files.
 fn wrong_arguments(error: &clap::Error) -> ExitCode {
     let text = error.render().to_string();
-    if escaped_lines(&text) == text {
+    let hint = recipe_entry(error, std::env::args().collect());
+    if escaped_lines(&text) == text && hint.is_none() {
         error.exit();
     }
     eprintln!("{}", text.trim_end());
+    if let Some(hint) = hint {
+        eprintln!("\n  tip: {hint}");
+    }
     ExitCode::from(2)
+}
+
+/// How to give what an unknown argument among `args` means, if that is an entry of recipes and the command takes a recipe.
+fn recipe_entry(error: &clap::Error, args: Vec<String>) -> Option<String> {
+    let ContextValue::String(unknown) = error.get(ContextKind::InvalidArg)? else { return None };
+    let is_it = |arg: &&String| arg.split('=').next() == unknown.split('=').next();
+    if error.kind() != ErrorKind::UnknownArgument || !unknown.starts_with("--") {
+        return None;
+    }
+    let command = Cli::command();
+    let command = command.find_subcommand(args.get(1)?)?;
+    command.get_arguments().find(|arg| arg.get_long() == Some("set"))?;
+    let place = args.iter().position(|arg| is_it(&arg))?;
+    let value = match args[place].split_once('=') {
+        Some((_, value)) => value,
+        None => args.get(place + 1).map_or("VALUE", String::as_str),
+    };
+    let key = Recipe::key_like(unknown.split('=').next()?.trim_start_matches('-'))?;
+    Some(format!("{key} is an entry of the recipe: use --set {key}={value}"))
 }
 
 /// Which recipe, and what to change in it.
 #[derive(Clone, Debug, Args)]
 struct RecipeArgs {
-    /// A built-in recipe (default, hyper, hyper-prelu, lenet, pilotnet) or a recipe file [default: default]
+    /// A built-in recipe (default, recording, hyper, hyper-prelu, lenet, pilotnet) or a recipe file [default: recording
+    /// with a recording, else default]
     #[arg(long, value_name = "NAME|FILE")]
     recipe: Option<String>,
     /// Change an entry of the recipe, as in epochs=3 or optimizer.learning_rate=1e-4
@@ -191,7 +218,12 @@ struct RecipeArgs {
 
 impl RecipeArgs {
     fn find(&self) -> Result<Recipe> {
-        Recipe::find(self.recipe.as_deref().unwrap_or("default"), &self.overrides)
+        self.find_or("default")
+    }
+
+    /// The recipe that is named, or else the built-in one called `default`.
+    fn find_or(&self, default: &str) -> Result<Recipe> {
+        Recipe::find(self.recipe.as_deref().unwrap_or(default), &self.overrides)
     }
 
     /// The recipe that is named, or else that of the model in the file `from`.
@@ -203,15 +235,17 @@ impl RecipeArgs {
     }
 }
 
-/// Reads a model, and says so if it has no digest.
-fn load_model(path: &Path) -> Result<Model> {
+/// Reads the model that `given` means, and says so if it has no digest.
+fn load_model(given: &Path) -> Result<Model> {
+    let path = &model_file(given)?;
     let model = Model::load(path)?;
     say_if_without_digest(path)?;
     Ok(model)
 }
 
-/// Reads a model to drive with, and says so if it has no digest.
-fn load_pilot(path: &Path) -> Result<Pilot> {
+/// Reads the model that `given` means to drive with it, and says so if it has no digest.
+fn load_pilot(given: &Path) -> Result<Pilot> {
+    let path = &model_file(given)?;
     let pilot = Pilot::load(path)?;
     say_if_without_digest(path)?;
     Ok(pilot)
@@ -245,6 +279,13 @@ fn stop_on_ctrl_c() -> Result<StopSignal> {
     Ok(stop)
 }
 
+/// The end of a command that went on after some of its inputs `failed`: the last error ends it, those before are told.
+fn end_with(mut failed: Vec<Error>) -> Result<()> {
+    let last = failed.pop();
+    failed.iter().for_each(|error| eprintln!("error: {error}"));
+    last.map_or(Ok(()), Err)
+}
+
 /// Refuses an output that exists already.
 fn refuse_existing(path: &Path) -> Result<()> {
     match path.exists() {
@@ -271,7 +312,7 @@ fn print(text: &str) -> Result<()> {
     let stdout = std::io::stdout();
     let text = terminal::fitted(&escaped_lines(text), &stdout);
     match stdout.lock().write_all(text.as_bytes()) {
-        Err(e) if e.kind() != ErrorKind::BrokenPipe => Err(Error::io("standard output")(e)),
+        Err(e) if e.kind() != io::ErrorKind::BrokenPipe => Err(Error::io("standard output")(e)),
         _ => Ok(()),
     }
 }
@@ -280,7 +321,7 @@ fn print(text: &str) -> Result<()> {
 fn print_json(value: &impl Serialize) -> Result<()> {
     let text = serde_json::to_string(value).map_err(|e| Error::Fault(format!("cannot be written as JSON: {e}")))?;
     match std::io::stdout().lock().write_all((escaped_json(&text) + "\n").as_bytes()) {
-        Err(e) if e.kind() != ErrorKind::BrokenPipe => Err(Error::io("standard output")(e)),
+        Err(e) if e.kind() != io::ErrorKind::BrokenPipe => Err(Error::io("standard output")(e)),
         _ => Ok(()),
     }
 }

@@ -5,8 +5,8 @@ use std::path::PathBuf;
 use clap::Args;
 use serde::Serialize;
 
-use super::{load_pilot, print, print_json};
-use crate::error::Result;
+use super::{end_with, load_pilot, print, print_json};
+use crate::error::{Error, Result};
 
 /// Print the steering a model gives for images
 #[derive(Debug, Args)]
@@ -16,7 +16,8 @@ pub struct PredictArgs {
     /// JPEG or PNG images
     #[arg(required = true, value_name = "IMAGE")]
     images: Vec<PathBuf>,
-    /// Print one JSON array as the last line: [{"image": …, "steering": …}, …]
+    /// Print one JSON array as the last line: [{"image": …, "steering": …}, …], with "error" in the
+    /// place of "steering" where an image cannot be read
     #[arg(long)]
     json: bool,
 }
@@ -24,20 +25,34 @@ pub struct PredictArgs {
 #[derive(Serialize)]
 struct Answer {
     image: PathBuf,
-    steering: f32,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    steering: Option<f32>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    error: Option<String>,
 }
 
 pub fn run(args: PredictArgs) -> Result<()> {
     let mut pilot = load_pilot(&args.model)?;
     let full_lock_deg = pilot.recipe().full_lock_deg;
-    let mut answers = Vec::new();
+    let (mut answers, mut failed): (Vec<Answer>, Vec<Error>) = Default::default();
     for image in args.images {
-        let steering = pilot.steer_file(&image)?;
-        if !args.json {
-            let angle_deg = f64::from(steering) * full_lock_deg;
-            print(&format!("{steering:+.4}  {angle_deg:+6.2} deg  {}\n", image.display()))?;
+        match pilot.steer_file(&image) {
+            Ok(steering) => {
+                if !args.json {
+                    let angle_deg = f64::from(steering) * full_lock_deg;
+                    print(&format!("{steering:+.4}  {angle_deg:+6.2} deg  {}\n", image.display()))?;
+                }
+                answers.push(Answer { image, steering: Some(steering), error: None });
+            }
+            // The other pictures are looked at all the same.
+            Err(error) => {
+                answers.push(Answer { image, steering: None, error: Some(error.to_string()) });
+                failed.push(error);
+            }
         }
-        answers.push(Answer { image, steering });
     }
-    if args.json { print_json(&answers) } else { Ok(()) }
+    if args.json {
+        print_json(&answers)?;
+    }
+    end_with(failed)
 }

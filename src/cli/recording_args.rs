@@ -62,6 +62,14 @@ impl RecordingArgs {
         Ok(all)
     }
 
+    /// As [`expand`](Self::expand), where pictures may stand among the recordings.
+    pub fn expand_recordings(&self, paths: &[PathBuf]) -> Result<Vec<PathBuf>> {
+        let each = paths
+            .iter()
+            .map(|path| if path.is_dir() { self.expand(vec![path.clone()]) } else { Ok(vec![path.clone()]) });
+        Ok(each.collect::<Result<Vec<_>>>()?.concat())
+    }
+
     /// Reads the recording at `path` as was said; its labels are what they seem to be.
     pub fn load(&self, path: &Path) -> Result<Recording> {
         let recording = dataset::load_with(path, &self.said(), dataset::ImageCheck::Verify)?;

@@ -5,16 +5,16 @@ use std::time::Instant;
 
 use serde::Serialize;
 
+use super::model_arg::model_file;
 use super::recording_args::RecordingArgs;
 use super::share_bar::ShareBar;
-use super::{pool, print, print_json, stop_on_ctrl_c};
+use super::{load_pilot, pool, print, print_json, stop_on_ctrl_c};
 use crate::error::{Error, Result};
 use crate::files::atomic_file;
 use crate::files::new_folder::NewFolder;
 use crate::geometry::GeometryEntry;
 use crate::observer::{StopSignal, Tally};
 use crate::picture::RgbImage;
-use crate::pilot::Pilot;
 use crate::replay::{
     ReplayLog, ReplayOptions, ReplayRun, ReplaySummary, WarpCheck, moments_csv, replay, side_camera_check, summarise,
 };
@@ -60,6 +60,10 @@ struct Report<'a> {
 
 pub fn run(args: &ReplayArgs) -> Result<()> {
     let pool = pool(args.threads)?;
+    // A model that is none is told before the recording is read.
+    let models =
+        [Some(args.model), args.against].into_iter().flatten().filter(|name| !matches!(*name, "zero" | "expert"));
+    models.map(|name| model_file(Path::new(name))).collect::<Result<Vec<_>>>()?;
     let recording = pool.install(|| args.reading.load(args.on))?;
     recording.require_usable()?;
     let geometry = match args.camera {
@@ -110,7 +114,7 @@ fn drive_on(log: &ReplayLog, options: &ReplayOptions, name: &str, stop: &StopSig
                     .into(),
             ));
         }
-        path => Some(Pilot::load(Path::new(path))?),
+        path => Some(load_pilot(Path::new(path))?),
     };
     let mut bar = ShareBar::new(format!("{name} on the recording"), stop);
     let meters = log.sessions.iter().map(|session| session.path.length_m() as usize + 1).sum();

@@ -9,8 +9,9 @@ use clap::Args;
 use image::{ImageFormat, RgbImage};
 use serde::Serialize;
 
+use super::recording_args::RecordingArgs;
 use super::{print, print_json};
-use crate::dataset::{self, View};
+use crate::dataset::{Recording, View};
 use crate::error::{Error, Result};
 use crate::files::new_folder::NewFolder;
 use crate::picture::{self, decode::decode_rgb};
@@ -38,6 +39,8 @@ pub struct TracksArgs {
     /// Draw TRACK-beside.png too: pictures of this recording, each with one of the track beside it
     #[arg(long, value_name = "RECORDING", requires = "sheet")]
     beside: Option<PathBuf>,
+    #[command(flatten)]
+    reading: RecordingArgs,
     /// Light and texture of the pictures; 0 is the track's own
     #[arg(long, default_value_t = 0)]
     seed: u64,
@@ -93,7 +96,8 @@ pub fn run(args: TracksArgs) -> Result<()> {
     let rows: Vec<Row> = tracks.iter().map(Row::of).collect();
     if let Some(out) = &args.sheet {
         let folder = NewFolder::create(out)?;
-        let given = args.beside.as_deref().map(|path| pictures(path, PAIRS.0 * PAIRS.1)).transpose()?;
+        let beside = args.beside.as_deref().map(|path| args.reading.load(path)).transpose()?;
+        let given = beside.map(|recording| pictures(&recording, PAIRS.0 * PAIRS.1)).transpose()?;
         for track in &tracks {
             draw(track, given.as_deref(), args.seed, folder.unfinished()).map_err(|error| folder.explain(error))?;
         }
@@ -143,23 +147,24 @@ fn save(sheet: &RgbImage, path: &Path) -> Result<()> {
     fs::write(path, bytes.into_inner()).map_err(Error::io(path))
 }
 
-/// Up to `most` pictures of the centre camera, at even distances through the recording `path`.
-fn pictures(path: &Path, most: usize) -> Result<Vec<RgbImage>> {
-    let recording = dataset::load(path)?;
-    let rows: Vec<PathBuf> =
-        (0..recording.rows.len()).filter_map(|row| recording.image_path(row, View::Centre)).collect();
+/// Up to `most` pictures of the centre camera, at even distances through `recording`.
+fn pictures(recording: &Recording, most: usize) -> Result<Vec<RgbImage>> {
+    let rows: Vec<usize> =
+        (0..recording.rows.len()).filter(|&row| recording.image_path(row, View::Centre).is_some()).collect();
     if rows.is_empty() {
-        return Err(Error::data(path, "no row has a picture of the centre camera; name another recording"));
+        let message = "no row has a picture of the centre camera; name another recording";
+        return Err(Error::data(&recording.path, message));
     }
     let n = most.min(rows.len());
-    let mut decoded = picture::RgbImage::default();
+    let (mut bytes, mut decoded) = (Vec::new(), picture::RgbImage::default());
     (0..n)
         .map(|k| {
-            let path = &rows[k * rows.len() / n];
-            let bytes = fs::read(path).map_err(Error::io(path))?;
-            decode_rgb(&bytes, &mut decoded).map_err(|e| Error::data(path, e))?;
+            let row = rows[k * rows.len() / n];
+            let path = recording.image_path(row, View::Centre).unwrap_or_default();
+            recording.read_picture(row, View::Centre, &mut bytes)?;
+            decode_rgb(&bytes, &mut decoded).map_err(|e| Error::data(&path, e))?;
             let (width, height) = (decoded.width as u32, decoded.height as u32);
-            RgbImage::from_raw(width, height, decoded.pixels.clone()).ok_or_else(|| Error::data(path, "has no pixels"))
+            RgbImage::from_raw(width, height, decoded.pixels.clone()).ok_or_else(|| Error::data(&path, "has no pixels"))
         })
         .collect()
 }

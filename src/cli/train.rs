@@ -7,6 +7,7 @@ use clap::Args;
 use steersman_kernels::Isa;
 use steersman_kernels::conv::ConvAlgorithm;
 
+use super::model_arg::model_file;
 use super::progress::{JobDisplay, TrainingDisplay};
 use super::recording_args::RecordingArgs;
 use super::words::counted;
@@ -17,6 +18,7 @@ use crate::main_job::job::{Job, JobNote, JobRequest, Scope};
 use crate::main_job::{MainJobResult, TrackResult};
 use crate::recipe::Recipe;
 use crate::report;
+use crate::text::percent;
 use crate::training::{self, RunFolder, TrainRequest, TrainResult, TransferRequest};
 
 /// Time of one core (Zen 3, 2.4 GHz) for recording and for driving, s.
@@ -90,10 +92,12 @@ pub fn run(args: TrainArgs) -> Result<()> {
     }
     let stop = stop_on_ctrl_c()?;
     let pool = pool(args.threads)?;
-    let from = args.from.map(|model| TransferRequest { model, freeze: args.freeze });
+    let from = args.from.as_deref().map(model_file).transpose()?;
+    let from = from.map(|model| TransferRequest { model, freeze: args.freeze });
     let recipe = || match &from {
         Some(from) => args.recipe.find_or_of(&from.model),
-        None => args.recipe.find(),
+        None if args.recordings.is_empty() => args.recipe.find(),
+        None => args.recipe.find_or("recording"),
     };
     let note = match &args.resume {
         Some(folder) => JobNote::read(folder)?,
@@ -254,11 +258,6 @@ fn explain_stop<T>(result: Result<T>, folder: Option<&Path>) -> Result<T> {
 
 /// A leak above this, in percent, is worth a word.
 const MUCH_LEAK: f64 = 3.0;
-
-/// A share in percent; one that is not 0 never reads as 0.
-fn percent(value: f64) -> String {
-    if value > 0.0 && value < 0.05 { "<0.1".into() } else { format!("{value:.1}") }
-}
 
 fn print_training(result: &TrainResult) {
     let twins = result.near_twin_percent.unwrap_or(0.0);

@@ -158,18 +158,26 @@ impl Unit {
         }
     }
 
-    /// The unit that labels between `min` and `max`, with half of them below `median`, are likely in; some are not in [-1, 1].
-    pub(crate) fn likely(min: f64, median: f64, max: f64) -> Unit {
+    /// The units that labels between `min` and `max`, with half of them below `median`, may be in, the likeliest first; some are
+    /// not in [-1, 1]. Which of several it is depends on how sharp the bends were.
+    pub(crate) fn likely(min: f64, median: f64, max: f64) -> &'static [Unit] {
         let reach = max.max(-min);
         if min >= 0.0 && max <= 180.0 && (60.0..=120.0).contains(&median) {
-            Unit::Servo
+            &[Unit::Servo]
         } else if reach <= std::f64::consts::FRAC_PI_2 {
-            Unit::Radians
+            &[Unit::Radians, Unit::Degrees, Unit::WheelRadians]
+        } else if reach <= 10.0 {
+            &[Unit::Degrees, Unit::WheelRadians]
         } else if reach <= 60.0 {
-            Unit::Degrees
+            &[Unit::Degrees, Unit::WheelDegrees]
         } else {
-            Unit::WheelDegrees
+            &[Unit::WheelDegrees]
         }
+    }
+
+    /// The angle of the front wheels that `label` means, in degrees to either side, if full lock is the usual one.
+    pub(crate) fn front_wheels_deg(self, label: f64) -> f64 {
+        25.0 * self.to_lock(label, self.full_lock_deg()).abs()
     }
 }
 
@@ -341,9 +349,12 @@ mod tests {
 
     #[test]
     fn the_likely_unit_is_told_by_range_and_median() {
-        assert_eq!(Unit::likely(-17.0, 0.0, 25.0), Unit::Degrees);
-        assert_eq!(Unit::likely(55.0, 90.0, 130.0), Unit::Servo);
-        assert_eq!(Unit::likely(-0.4, 0.0, 1.3), Unit::Radians);
-        assert_eq!(Unit::likely(-300.0, 0.0, 90.0), Unit::WheelDegrees);
+        assert_eq!(Unit::likely(-17.0, 0.0, 25.0), [Unit::Degrees, Unit::WheelDegrees]);
+        assert_eq!(Unit::likely(55.0, 90.0, 130.0), [Unit::Servo]);
+        // A straight road in degrees, or sharp bends in radians.
+        assert_eq!(Unit::likely(-0.4, 0.0, 1.3), [Unit::Radians, Unit::Degrees, Unit::WheelRadians]);
+        assert_eq!(Unit::likely(-7.0, 0.0, 6.5), [Unit::Degrees, Unit::WheelRadians]);
+        assert_eq!(Unit::likely(-300.0, 0.0, 90.0), [Unit::WheelDegrees]);
+        assert!((Unit::WheelDegrees.front_wheels_deg(-160.0) - 10.0).abs() < 1e-9);
     }
 }

@@ -81,16 +81,16 @@ fn find_deeper(store: &Store, path: &Path) -> Result<(&'static Format, PathBuf)>
         );
         return Err(Error::data(path, message));
     }
-    for file in store.list(path)?.iter().filter(|path| store.is_file(path)) {
-        if let Some(what) = name_of_foreign(store, file).filter(|what| !what.starts_with("is a picture")) {
-            return Err(Error::data(path, format!("no recording here; {} {what}", file_name(file))));
-        }
-    }
     if store.is_file(&path.join("run.json")) || store.is_file(&path.join("model.safetensors")) {
         return Err(Error::data(
             path,
             "is the folder of a run, no recording: name the model first, then the recordings",
         ));
+    }
+    for file in store.list(path)?.iter().filter(|path| store.is_file(path)) {
+        if let Some(what) = name_of_foreign(store, file).filter(|what| !what.starts_with("is a picture")) {
+            return Err(Error::data(path, format!("no recording here; {} {what}", file_name(file))));
+        }
     }
     Err(Error::data(
         path,

@@ -211,7 +211,8 @@ impl Recording {
 
     /// Seconds driven: the sum over the sessions.
     pub fn driven_s(&self) -> f64 {
-        self.sessions.iter().map(|session| self.session_s(session)).sum()
+        // The sum of nothing is -0.0.
+        self.sessions.iter().map(|session| self.session_s(session)).sum::<f64>() + 0.0
     }
 
     /// Length of a session in seconds, from its first to its last row.

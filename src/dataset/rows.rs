@@ -316,12 +316,21 @@ fn unit_trouble(rows: &[Row], beyond: &mut [f64], line: &str) -> String {
     let count = beyond.len();
     let mut all: Vec<f64> = rows.iter().map(|row| f64::from(row.steering)).chain(beyond.iter().copied()).collect();
     all.sort_unstable_by(f64::total_cmp);
-    let unit = Unit::likely(all[0], all[all.len() / 2], all[all.len() - 1]);
+    let (min, max) = (all[0], all[all.len() - 1]);
+    let units = Unit::likely(min, all[all.len() / 2], max);
+    let looks: Vec<&str> = units.iter().map(|unit| unit.text()).collect();
+    let meaning = |unit: &Unit| {
+        let sharpest_deg = unit.front_wheels_deg(min).max(unit.front_wheels_deg(max));
+        format!("--unit {unit} if the front wheels turned by {sharpest_deg:.1} degrees in the sharpest bend")
+    };
+    let choices: Vec<String> = units.iter().map(meaning).collect();
     format!(
-        "{count} of {} labels are not in [-1, 1], the first is {first} ({line}): these labels look like {}. Say so with --unit \
-         {unit}, or with unit = \"{unit}\" in steersman.toml beside the log; --unit lock leaves these rows out",
+        "{count} of {} labels are not in [-1, 1], the first is {first} ({line}): these labels look like {}. Say {}; or unit = \
+         \"{}\" in steersman.toml beside the log; --unit lock leaves these rows out",
         all.len(),
-        unit.text()
+        looks.join(" or "),
+        choices.join(", "),
+        units[0]
     )
 }
 

@@ -1,4 +1,6 @@
-//! Losses: value and gradient.
+//! Losses and the terms of smoothness: value and gradient.
+
+use std::ops::Range;
 
 use serde::{Deserialize, Serialize};
 
@@ -45,6 +47,144 @@ impl Loss {
     }
 }
 
+/// The `[smoothness]` table of a recipe: terms of the loss that punish answers which differ where they should not (after CAPS,
+/// Mysore et al. 2021). A wheel trembles by the differences between neighbouring frames, to which the mean squared error of single
+/// frames is blind.
+///
+/// For the images a and b of a pair, with predictions f and labels y, the loss grows by
+/// `weight · mean over the pairs of ((f_a − f_b) − (y_a − y_b))²`. Differences are compared with those of the labels, so a pair may
+/// show different places, and a change that the labels ask for costs nothing.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Smoothness {
+    /// Share of the images of a batch that stand in pairs, in (0, 1]; half of the pairs are spatial and half temporal if both have
+    /// a weight.
+    pub pairs_share: f64,
+    /// Weight of the spatial term: each pair is an image twice, under two augmentations.
+    pub spatial: f64,
+    /// Weight of the temporal term: each pair is two neighbouring frames of a session, from one camera and under the same
+    /// augmentation, as the light does not change between frames.
+    pub temporal: f64,
+}
+
+impl Default for Smoothness {
+    fn default() -> Smoothness {
+        Smoothness { pairs_share: 0.5, spatial: 0.0, temporal: 0.0 }
+    }
+}
+
+impl Smoothness {
+    /// Whether no term has a weight: batches hold no pairs.
+    pub fn is_off(&self) -> bool {
+        self.spatial == 0.0 && self.temporal == 0.0
+    }
+
+    /// The pairs of a full batch of `batch` images.
+    pub fn pairs(&self, batch: usize) -> Pairs {
+        let all = if self.is_off() { 0 } else { (batch as f64 * self.pairs_share / 2.0) as usize };
+        let temporal = match (self.spatial > 0.0, self.temporal > 0.0) {
+            (true, true) => all / 2,
+            (_, temporal) => all * usize::from(temporal),
+        };
+        Pairs { spatial: all - temporal, temporal }
+    }
+
+    /// Checks the ranges of all numbers for batches of `batch` images; the error names the first that is wrong.
+    pub fn check(&self, batch: usize) -> Result<(), String> {
+        for (name, weight) in [("spatial", self.spatial), ("temporal", self.temporal)] {
+            if !(weight.is_finite() && weight >= 0.0) {
+                return Err(format!("{name} must not be negative or infinite, but is {weight}"));
+            }
+        }
+        if !(self.pairs_share > 0.0 && self.pairs_share <= 1.0) {
+            return Err(format!("pairs_share must lie in (0, 1], not be {}", self.pairs_share));
+        }
+        let (Pairs { spatial, temporal }, wanted) = (self.pairs(batch), [self.spatial, self.temporal]);
+        if (spatial == 0 && wanted[0] > 0.0) || (temporal == 0 && wanted[1] > 0.0) {
+            return Err(format!("pairs_share {} of a batch of {batch} leaves no pair for a term", self.pairs_share));
+        }
+        Ok(())
+    }
+}
+
+/// The pairs in a batch: its first images, (0, 1), (2, 3) and so on. The spatial pairs come first, then the temporal ones.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Pairs {
+    /// Number of spatial pairs.
+    pub spatial: usize,
+    /// Number of temporal pairs.
+    pub temporal: usize,
+}
+
+impl Pairs {
+    /// Number of images that stand in pairs.
+    pub fn images(&self) -> usize {
+        2 * (self.spatial + self.temporal)
+    }
+}
+
+/// The smoothness terms of one batch.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct PairTerms {
+    pairs: Pairs,
+    /// Weights of the spatial and of the temporal term.
+    weights: [f64; 2],
+}
+
+impl PairTerms {
+    /// The terms of a batch that holds `pairs`.
+    pub fn new(smoothness: &Smoothness, pairs: Pairs) -> PairTerms {
+        PairTerms { pairs, weights: [smoothness.spatial, smoothness.temporal] }
+    }
+
+    /// Number of images that stand in pairs.
+    pub fn images(&self) -> usize {
+        self.pairs.images()
+    }
+
+    /// Returns what the pairs among the images `images` of the batch add to the mean loss, and adds its derivative to `gradient`.
+    /// `predictions`, `labels` and `gradient` are those of `images`, `outputs` each.
+    ///
+    /// # Panics
+    ///
+    /// Panics if the lengths differ, or if `images` cuts a pair.
+    pub fn add(
+        &self,
+        images: Range<usize>,
+        outputs: usize,
+        predictions: &[f32],
+        labels: &[f32],
+        gradient: &mut [f32],
+    ) -> f64 {
+        let len = images.len() * outputs;
+        assert_eq!((predictions.len(), labels.len(), gradient.len()), (len, len, len));
+        let Pairs { spatial, temporal } = self.pairs;
+        let mut sum = 0.0;
+        for (of, count, weight) in
+            [(0..2 * spatial, spatial, self.weights[0]), (2 * spatial..self.images(), temporal, self.weights[1])]
+        {
+            let (from, to) = (of.start.max(images.start), of.end.min(images.end));
+            if from >= to {
+                continue;
+            }
+            assert!(from % 2 == 0 && to % 2 == 0, "a pair of images {from} to {to} is cut");
+            let scale = weight / (count * outputs) as f64;
+            for pair in (from..to).step_by(2) {
+                let (a, b) = ((pair - images.start) * outputs, (pair + 1 - images.start) * outputs);
+                for output in 0..outputs {
+                    let (a, b) = (a + output, b + output);
+                    let difference = (predictions[a] - predictions[b]) - (labels[a] - labels[b]);
+                    sum += scale * f64::from(difference * difference);
+                    let slope = (2.0 * scale) as f32 * difference;
+                    gradient[a] += slope;
+                    gradient[b] -= slope;
+                }
+            }
+        }
+        sum
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -70,5 +210,62 @@ mod tests {
                 assert!((slope - f64::from(gradient[0])).abs() <= 2e-3, "{loss:?} at {prediction}");
             }
         }
+    }
+
+    #[test]
+    fn pairs_share_the_batch() {
+        let of = |spatial, temporal| Smoothness { spatial, temporal, ..Smoothness::default() };
+        assert_eq!(of(0.0, 0.0).pairs(64), Pairs::default());
+        assert_eq!(of(1.0, 0.0).pairs(64), Pairs { spatial: 16, temporal: 0 });
+        assert_eq!(of(0.0, 1.0).pairs(64), Pairs { spatial: 0, temporal: 16 });
+        assert_eq!(of(1.0, 1.0).pairs(70), Pairs { spatial: 9, temporal: 8 });
+        assert!(of(1.0, 1.0).check(64).is_ok() && of(0.0, 0.0).check(1).is_ok());
+        assert!(of(1.0, 1.0).check(4).unwrap_err().contains("leaves no pair"));
+        assert!(of(-1.0, 0.0).check(64).unwrap_err().contains("spatial"));
+        assert!(Smoothness { pairs_share: 0.0, ..of(1.0, 0.0) }.check(64).unwrap_err().contains("pairs_share"));
+    }
+
+    /// Six images of two outputs: a spatial pair, a temporal pair, two single ones.
+    #[test]
+    fn the_terms_are_those_of_the_formula_and_gradients_their_slopes() {
+        let terms = PairTerms::new(
+            &Smoothness { pairs_share: 0.5, spatial: 3.0, temporal: 5.0 },
+            Pairs { spatial: 1, temporal: 1 },
+        );
+        let labels = [0.5, 0.0, 0.25, 1.0, 0.0, 0.0, -1.0, 0.5, 9.0, 9.0, 9.0, 9.0];
+        let predictions = [1.0, 2.0, 0.25, 1.5, 0.0, 1.0, 1.0, 0.5, 1.0, 2.0, 3.0, 4.0];
+        let mut gradient = [1.0; 12];
+        let value = terms.add(0..6, 2, &predictions, &labels, &mut gradient);
+        // Differences of the predictions less those of the labels: 0.75 − 0.25, 0.5 + 1; then −1 − 1, 0.5 + 0.5.
+        let expected = 3.0 * (0.25 + 2.25) / 2.0 + 5.0 * (4.0 + 1.0) / 2.0;
+        assert!((value - expected).abs() < 1e-12, "{value} is not {expected}");
+        for at in 0..12 {
+            let shifted = |by: f32| {
+                let mut predictions = predictions;
+                predictions[at] += by;
+                terms.add(0..6, 2, &predictions, &labels, &mut [0.0; 12])
+            };
+            let slope = (shifted(0.125) - shifted(-0.125)) / 0.25;
+            assert!((slope - f64::from(gradient[at] - 1.0)).abs() < 1e-5, "{at}: {slope}, {}", gradient[at]);
+        }
+        assert_eq!(gradient[8..], [1.0; 4], "single images have no part in it");
+        // The same, shard by shard.
+        let mut parts = [1.0; 12];
+        let sum: f64 = [0..2, 2..6]
+            .into_iter()
+            .map(|images| {
+                let of = images.start * 2..images.end * 2;
+                terms.add(images, 2, &predictions[of.clone()], &labels[of.clone()], &mut parts[of])
+            })
+            .sum();
+        assert_eq!((sum, parts), (value, gradient));
+    }
+
+    #[test]
+    #[should_panic(expected = "is cut")]
+    fn a_pair_that_is_cut_is_a_mistake() {
+        let terms =
+            PairTerms::new(&Smoothness { spatial: 1.0, ..Smoothness::default() }, Pairs { spatial: 2, temporal: 0 });
+        terms.add(0..3, 1, &[0.0; 3], &[0.0; 3], &mut [0.0; 3]);
     }
 }

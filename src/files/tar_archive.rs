@@ -80,9 +80,10 @@ fn checksum_fits(header: &[u8; BLOCK as usize]) -> bool {
 /// A number in octal digits, or in binary where the first bit is set.
 fn number(field: &[u8]) -> Option<u64> {
     if field[0] & 0x80 != 0 {
-        let start = field.len() - 8;
-        let rest = field[1..start].iter().all(|&byte| byte == 0) && field[0] == 0x80;
-        return rest.then(|| u64::from_be_bytes(std::array::from_fn(|i| field[start + i])));
+        let mut digits = field[1..].iter();
+        return digits.try_fold(u64::from(field[0] & 0x7f), |number, &digit| {
+            number.checked_mul(256)?.checked_add(u64::from(digit))
+        });
     }
     let text = std::str::from_utf8(field).ok()?;
     u64::from_str_radix(text.trim_matches(['\0', ' ']), 8).ok()
@@ -148,6 +149,17 @@ mod tests {
         }
         // A cut archive has what came before the cut.
         assert_eq!(list(&archive[..1100]).unwrap().len(), 1);
+    }
+
+    #[test]
+    fn numbers_are_octal_or_binary_and_nothing_else() {
+        assert_eq!(number(b"00000001750\0"), Some(1000));
+        assert_eq!(number(b" 17\0\0\0\0\0"), Some(15));
+        // In 12 bytes as GNU tar writes them, and in the 8 of a checksum.
+        assert_eq!(number(&[0x80, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 2]), Some((1 << 32) + 2));
+        assert_eq!(number(&[0x80, 0, 0, 0, 0, 0, 1, 2]), Some(258));
+        assert_eq!(number(&[0xff; 12]), None);
+        assert_eq!(number(b"9\0\0\0\0\0\0\0"), None);
     }
 
     #[test]

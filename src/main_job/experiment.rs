@@ -1,4 +1,5 @@
-//! The two experiments of the write-ups, closed-loop: what a number promises beside what the road delivers.
+//! Experiments, closed-loop: the two of the write-ups (what a number promises beside what the road delivers), and what makes the wheel
+//! calm.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -11,6 +12,10 @@ use super::{TrackResult, training_set};
 use crate::dataset::Description;
 use crate::dataset::colour::Colour;
 use crate::dataset::split::SplitMode;
+use crate::engine::layers::{BlurSpec, ZeroPadSpec};
+use crate::engine::loss::Smoothness;
+use crate::engine::network::LayerSpec;
+use crate::engine::optimizer::AveragingSpec;
 use crate::error::{Error, Result};
 use crate::files::atomic_file;
 use crate::observer::{Observer, StopSignal};
@@ -26,7 +31,13 @@ pub enum Subject {
     Split,
     /// The colours that the network sees: RGB, YUV, HSV, the saturation alone, grey.
     Colour,
+    /// What makes the wheel calm: the recipe as it is, averaged weights, each term of smoothness, blur before each stride, all of them.
+    Smooth,
 }
+
+/// Decay of the averaged weights, and weights of the smoothness terms, of [`Subject::Smooth`].
+const DECAY: f64 = 0.998;
+const TERM: f64 = 2.0;
 
 impl Subject {
     /// The recipes to compare, each with its name, made from `base`.
@@ -52,8 +63,35 @@ impl Subject {
                 (name, recipe)
             })
             .to_vec(),
+            Subject::Smooth => {
+                let plain = || Recipe { averaging: None, smoothness: None, ..base.clone() };
+                let averaging = Some(AveragingSpec::Ema { decay: DECAY, from_share: 0.0, refit_batches: 0 });
+                let terms = |spatial, temporal| Some(Smoothness { spatial, temporal, ..Smoothness::default() });
+                let layers = blurred(&base.layers);
+                vec![
+                    ("plain", plain()),
+                    ("averaged", Recipe { averaging, ..plain() }),
+                    ("spatial", Recipe { smoothness: terms(TERM, 0.0), ..plain() }),
+                    ("temporal", Recipe { smoothness: terms(0.0, TERM), ..plain() }),
+                    ("blur", Recipe { layers: layers.clone(), ..plain() }),
+                    ("together", Recipe { averaging, smoothness: terms(TERM, TERM), layers, ..plain() }),
+                ]
+            }
         }
     }
+}
+
+/// `layers` with a blur of 3x3 before each convolution with a stride. Zeros around it keep the shapes.
+fn blurred(layers: &[LayerSpec]) -> Vec<LayerSpec> {
+    let mut blurred = Vec::new();
+    for layer in layers {
+        if matches!(layer, LayerSpec::Conv2d(conv) if conv.stride != [1, 1]) {
+            blurred.push(LayerSpec::ZeroPad(ZeroPadSpec { rows: [1, 1], columns: [1, 1] }));
+            blurred.push(LayerSpec::Blur(BlurSpec { window: [3, 3], stride: [1, 1] }));
+        }
+        blurred.push(layer.clone());
+    }
+    blurred
 }
 
 /// An experiment.
@@ -67,6 +105,8 @@ pub struct ExperimentPlan {
     pub seeds: u64,
     /// Recordings that are trained on.
     pub recordings: Vec<PathBuf>,
+    /// What the user says about them.
+    pub said: Description,
     /// Tracks that are driven.
     pub tracks: Vec<String>,
     /// Runs on each track, of one lap.
@@ -98,6 +138,18 @@ pub struct ExperimentRow {
     pub autonomy_percent: f64,
     /// Mean over the tracks of the distance from the line, m.
     pub cte_mean_m: f64,
+    /// Mean over the tracks of the whiteness, deg/s.
+    pub whiteness_deg_s: f64,
+    /// The same for the expert.
+    pub expert_whiteness_deg_s: f64,
+    /// The largest whiteness on a track, deg/s.
+    pub worst_whiteness_deg_s: f64,
+    /// Mean over the tracks of the wheel reversals a minute.
+    pub reversals_per_min: f64,
+    /// Mean over the tracks of the 95th percentile of the angle's change a frame, deg.
+    pub angle_change_p95_deg: f64,
+    /// Mean over the tracks of the lateral jerk, m/s³.
+    pub lateral_jerk_rms_mps3: f64,
     /// Held-out tracks that were trained on all the same.
     pub trained_on_held_out: Vec<String>,
 }
@@ -136,13 +188,13 @@ pub fn run(
     let folder = tempfile::tempdir().map_err(Error::io(std::env::temp_dir()))?;
     let mut trials = Vec::new();
     for (variant, recipe) in plan.subject.variants(&plan.recipe) {
-        // Not every colour space fits every network; say so before minutes are spent.
-        recipe.network(steersman_kernels::Isa::best())?;
+        // Not every colour space fits every network, nor every term every grouping; say so before minutes are spent.
+        Recipe::parse(variant, &recipe.to_toml()?, &[])?;
         for seed in 1..=plan.seeds {
             observer.observe(ExperimentEvent::Job(JobEvent::Notice(format!("{variant}, seed {seed}"))))?;
             let request = TrainRequest {
                 recordings: plan.recordings.clone(),
-                said: Description::default(),
+                said: plan.said.clone(),
                 recipe: recipe.clone(),
                 out: folder.path().join(format!("{variant}-{seed}")),
                 seed,
@@ -168,6 +220,12 @@ pub fn run(
                 laps_total: drives.iter().map(|d| d.drive.laps_total).sum(),
                 autonomy_percent: mean(&|d| d.drive.autonomy_percent),
                 cte_mean_m: mean(&|d| d.drive.cte_mean_m),
+                whiteness_deg_s: mean(&|d| d.drive.whiteness_deg_s),
+                expert_whiteness_deg_s: mean(&|d| d.drive.expert_whiteness_deg_s),
+                worst_whiteness_deg_s: drives.iter().map(|d| d.drive.whiteness_deg_s).fold(0.0, f64::max),
+                reversals_per_min: mean(&|d| d.drive.calm.unwrap_or_default().reversals_per_min),
+                angle_change_p95_deg: mean(&|d| d.drive.calm.unwrap_or_default().angle_change_p95_deg),
+                lateral_jerk_rms_mps3: mean(&|d| d.drive.calm.unwrap_or_default().lateral_jerk_rms_mps3),
                 trained_on_held_out: training.trained_on_held_out,
             };
             observer.observe(ExperimentEvent::Row(trial.clone()))?;
@@ -216,17 +274,38 @@ mod tests {
     fn variants_differ_in_the_subject_alone_and_fit_every_shipped_network() {
         for (name, _) in crate::recipe::SHIPPED {
             let base = Recipe::find(name, &[]).unwrap();
-            for subject in [Subject::Split, Subject::Colour] {
+            for subject in [Subject::Split, Subject::Colour, Subject::Smooth] {
                 for (variant, mut recipe) in subject.variants(&base) {
                     recipe
                         .network(steersman_kernels::Isa::PORTABLE)
                         .unwrap_or_else(|e| panic!("{name} {variant}: {e}"));
                     recipe.split.mode = base.split.mode;
                     recipe.preprocessing.colour = base.preprocessing.colour;
+                    (recipe.averaging, recipe.smoothness) = (base.averaging, base.smoothness);
+                    recipe.layers.clone_from(&base.layers);
                     assert_eq!(recipe, base);
                 }
             }
         }
+    }
+
+    #[test]
+    fn what_makes_the_wheel_calm_is_tried_alone_and_together() {
+        let base = Recipe::find("default", &[]).unwrap();
+        let variants = Subject::Smooth.variants(&base);
+        assert_eq!(variants[0], ("plain", base.clone()));
+        for (name, recipe) in &variants {
+            // Each is a recipe that could be written and read.
+            let read = Recipe::parse(name, &recipe.to_toml().unwrap(), &[]).unwrap_or_else(|e| panic!("{name}: {e}"));
+            assert_eq!(read, *recipe);
+        }
+        let differences = |recipe: &Recipe| {
+            [recipe.averaging.is_some(), recipe.smoothness.is_some(), recipe.layers != base.layers].map(u8::from)
+        };
+        let found: Vec<_> = variants.iter().map(|(_, recipe)| differences(recipe)).collect();
+        assert_eq!(found, [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]]);
+        let blurs = variants[4].1.layers.iter().filter(|layer| layer.base_name() == "blur").count();
+        assert_eq!((blurs, variants[4].1.layers[1].base_name()), (3, "blur"));
     }
 
     #[test]
@@ -242,6 +321,12 @@ mod tests {
             laps_total: 4,
             autonomy_percent: 99.0,
             cte_mean_m: 0.1,
+            whiteness_deg_s: 8.0,
+            expert_whiteness_deg_s: 1.0,
+            worst_whiteness_deg_s: 9.0,
+            reversals_per_min: 30.0,
+            angle_change_p95_deg: 1.5,
+            lateral_jerk_rms_mps3: 5.0,
             trained_on_held_out: vec!["coast".into(), "random:1000001".into()],
         };
         let folder = tempfile::tempdir().unwrap();
@@ -249,9 +334,10 @@ mod tests {
         write_csv(&path, &[trial.clone(), ExperimentRow { trained_on_held_out: Vec::new(), ..trial }]).unwrap();
         let text = std::fs::read_to_string(&path).unwrap();
         let expected = "variant,seed,leak_percent,val_center_mse,val_mae_deg,fresh_mae_deg,laps_completed,laps_total,\
-                        autonomy_percent,cte_mean_m,trained_on_held_out\n\
-                        blocks,3,12.5,,0.25,1.0,2,4,99.0,0.1,coast random:1000001\n\
-                        blocks,3,12.5,,0.25,1.0,2,4,99.0,0.1,\n";
+                        autonomy_percent,cte_mean_m,whiteness_deg_s,expert_whiteness_deg_s,worst_whiteness_deg_s,\
+                        reversals_per_min,angle_change_p95_deg,lateral_jerk_rms_mps3,trained_on_held_out\n\
+                        blocks,3,12.5,,0.25,1.0,2,4,99.0,0.1,8.0,1.0,9.0,30.0,1.5,5.0,coast random:1000001\n\
+                        blocks,3,12.5,,0.25,1.0,2,4,99.0,0.1,8.0,1.0,9.0,30.0,1.5,5.0,\n";
         assert_eq!(text, expected);
     }
 

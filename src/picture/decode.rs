@@ -96,20 +96,15 @@ fn decode_jpeg(bytes: &[u8], max_side: usize, image: &mut RgbImage) -> Result<()
         .set_max_height(max_side)
         .set_strict_mode(false);
     let failed = |error: zune_jpeg::errors::DecodeErrors| format!("the JPEG cannot be decoded: {error:?}");
-    // The decoder goes on with grey where an end marker comes too early. Zeros in its place show how far the data reach: those
-    // of a whole picture end before the decoder, which reads 8 bytes ahead, has used them up.
+    // The decoder goes on with grey where an end marker comes too early. What stands in its place here shows how far the data
+    // reach: those of a whole picture end before the decoder, which reads 8 bytes ahead, has used it up.
     let scan = Scan::of(bytes)?;
-    let padded: Vec<u8>;
-    let data = if scan.progressive {
-        if !scan.ended {
-            return Err("the JPEG is truncated".into());
-        }
-        bytes
-    } else {
-        padded = [&bytes[..scan.end], &[0; AHEAD]].concat();
-        &padded
+    let data = match scan.progressive {
+        Some(all) if !(scan.ended && all) => return Err("the JPEG is truncated".into()),
+        Some(_) => [&bytes[..scan.end], &NO_CODE, &[0xff, 0xd9]].concat(),
+        None => [&bytes[..scan.end], &[0; AHEAD]].concat(),
     };
-    let mut decoder = JpegDecoder::new_with_options(ZCursor::new(data), lenient);
+    let mut decoder = JpegDecoder::new_with_options(ZCursor::new(&data), lenient);
     decoder.decode_headers().map_err(failed)?;
     let (width, height) = decoder.dimensions().ok_or("the JPEG has no size")?;
     check_pixels(height, width)?;
@@ -133,6 +128,17 @@ fn decode_jpeg(bytes: &[u8], max_side: usize, image: &mut RgbImage) -> Result<()
 
 /// Bytes behind the picture data that the decoder may read ahead, and some more.
 const AHEAD: usize = 16;
+/// As many ones, as picture data have them: no Huffman code consists of ones alone, so whoever reads on stops with an error. Where
+/// zeros are a code, one of them may end all the blocks that a pass of a progressive picture lacks.
+const NO_CODE: [u8; 2 * AHEAD] = {
+    let mut bytes = [0; 2 * AHEAD];
+    let mut i = 0;
+    while i < bytes.len() {
+        bytes[i] = 0xff;
+        i += 2;
+    }
+    bytes
+};
 
 /// Where the picture data of a JPEG end.
 #[derive(Debug, PartialEq, Eq)]
@@ -141,14 +147,62 @@ struct Scan {
     end: usize,
     /// Whether an end marker stands there.
     ended: bool,
-    /// Whether the data come in several passes over the picture.
-    progressive: bool,
+    /// For data that come in several passes over the picture: whether these send every bit of every coefficient.
+    progressive: Option<bool>,
+}
+
+/// Coefficients of a block.
+const COEFFICIENTS: usize = 64;
+
+/// What the passes of a progressive picture have sent.
+#[derive(Default)]
+struct Passes {
+    /// For each component, by its identifier: the bits that each coefficient still lacks.
+    lacking: Vec<(u8, [u8; COEFFICIENTS])>,
+}
+
+impl Passes {
+    /// Takes note of the frame header `segment`, which names the components.
+    fn frame(&mut self, segment: &[u8]) {
+        let components = segment.get(6..).unwrap_or_default().as_chunks::<3>().0;
+        self.lacking = components.iter().map(|component| (component[0], [u8::MAX; COEFFICIENTS])).collect();
+    }
+
+    /// Takes note of the scan header `segment`.
+    fn scan(&mut self, segment: &[u8]) {
+        let [count, rest @ ..] = segment else { return };
+        let Some((components, [start, end, bits])) = rest.split_at_checked(2 * usize::from(*count)) else { return };
+        for [id, _] in components.as_chunks::<2>().0 {
+            let of_component = self.lacking.iter_mut().filter(|(component, _)| component == id);
+            for (_, lacking) in of_component {
+                let sent = usize::from(*start)..COEFFICIENTS.min(usize::from(*end) + 1);
+                lacking.get_mut(sent).unwrap_or_default().fill(bits & 0x0f);
+            }
+        }
+    }
+
+    fn sent_all(&self) -> bool {
+        self.lacking.iter().all(|(_, lacking)| lacking.iter().all(|&bits| bits == 0))
+    }
+}
+
+/// Index of the first byte 0xff. Blocks without one are passed by as a whole, which vectorises.
+fn first_0xff(bytes: &[u8]) -> Option<usize> {
+    let (blocks, _) = bytes.as_chunks::<32>();
+    let has_one = |block: &[u8; 32]| block.iter().fold(false, |found, &byte| found | (byte == 0xff));
+    let begin = 32 * blocks.iter().position(has_one).unwrap_or(blocks.len());
+    Some(begin + bytes[begin..].iter().position(|&byte| byte == 0xff)?)
 }
 
 impl Scan {
     fn of(bytes: &[u8]) -> Result<Scan, String> {
         let truncated = || "the JPEG is truncated".to_string();
-        let (mut at, mut progressive) = (2, false);
+        let (mut at, mut passes) = (2, None::<Passes>);
+        let found = |end: usize, ended: bool, passes: &Option<Passes>| Scan {
+            end,
+            ended,
+            progressive: passes.as_ref().map(Passes::sent_all),
+        };
         loop {
             // Segments, each with its length, up to the picture data.
             let marker = loop {
@@ -162,23 +216,29 @@ impl Scan {
             };
             at += 2;
             match marker {
-                0xd9 => return Ok(Scan { end: at - 2, ended: true, progressive }),
+                0xd9 => return Ok(found(at - 2, true, &passes)),
                 0x01 | 0xd0..=0xd8 => continue,
                 _ => {}
             }
-            progressive |= matches!(marker, 0xc2 | 0xc6 | 0xca | 0xce);
             let length = bytes.get(at..at + 2).ok_or_else(truncated)?;
-            at += usize::from(u16::from_be_bytes([length[0], length[1]])).max(2);
+            let next = at + usize::from(u16::from_be_bytes([length[0], length[1]])).max(2);
+            let segment = bytes.get(at + 2..next).unwrap_or_default();
+            at = next;
+            match marker {
+                0xc2 | 0xc6 | 0xca | 0xce => passes.get_or_insert_default().frame(segment),
+                0xda => passes.iter_mut().for_each(|passes| passes.scan(segment)),
+                _ => {}
+            }
             if marker != 0xda {
                 continue;
             }
             // Picture data: 0xff is followed by 0 or a restart marker, up to the next segment.
             loop {
-                let found = bytes.get(at..).and_then(|rest| rest.iter().position(|&byte| byte == 0xff));
-                let Some(found) = found else { return Ok(Scan { end: bytes.len(), ended: false, progressive }) };
-                at += found;
+                let place = bytes.get(at..).and_then(first_0xff);
+                let Some(marker) = place else { return Ok(found(bytes.len(), false, &passes)) };
+                at += marker;
                 match bytes.get(at + 1) {
-                    None => return Ok(Scan { end: at, ended: false, progressive }),
+                    None => return Ok(found(at, false, &passes)),
                     Some(0 | 0xd0..=0xd7) => at += 2,
                     Some(0xff) => at += 1,
                     Some(_) => break,
@@ -336,6 +396,39 @@ mod tests {
     }
 
     #[test]
+    fn pictures_of_every_kind_of_colour_are_read_or_named() {
+        use image::ExtendedColorType::{L8, L16, La8, Rgb16, Rgba8};
+        let (width, height) = (24, 16);
+        let grey = |x: usize, y: usize| (x * 8 + y) as u8;
+        for colour in [L8, L16, La8, Rgb16, Rgba8] {
+            let channels = usize::from(colour.channel_count());
+            let bytes = usize::from(colour.bits_per_pixel()) / 8 / channels;
+            let value = |x: usize, y: usize, channel: usize| match (channels, channel) {
+                (2, 1) | (4, 3) => 255,
+                _ => grey(x, y),
+            };
+            let pixels: Vec<u8> = (0..height * width * channels)
+                .flat_map(|i| vec![value(i / channels % width, i / channels / width, i % channels); bytes])
+                .collect();
+            let mut png = Vec::new();
+            let encoder = image::codecs::png::PngEncoder::new(&mut png);
+            encoder.write_image(&pixels, width as u32, height as u32, colour).unwrap();
+            let mut image = RgbImage::default();
+            decode_rgb(&png, &mut image).unwrap();
+            assert_eq!((image.height, image.width), (height, width));
+            assert_eq!(image.pixel(3, 20), [grey(20, 3); 3], "{colour:?}");
+        }
+        let mut cmyk = Vec::new();
+        let encoder = jpeg_encoder::Encoder::new(&mut cmyk, 90);
+        encoder.encode(&[90; 24 * 16 * 4], 24, 16, jpeg_encoder::ColorType::Cmyk).unwrap();
+        let mut image = RgbImage::default();
+        match decode_rgb(&cmyk, &mut image) {
+            Ok(()) => assert_eq!((image.height, image.width), (height, width)),
+            Err(message) => assert!(message.contains("colours"), "{message}"),
+        }
+    }
+
+    #[test]
     fn broken_images_are_errors() {
         let whole = jpeg(&gradient(40, 24), 40, 24);
         let mut image = RgbImage::default();
@@ -382,6 +475,39 @@ mod tests {
                                 "{part} of 10, {marker:?}, restart {restart}"
                             );
                         }
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_progressive_picture_that_was_cut_is_damaged_wherever_it_was_cut() {
+        let (width, height) = (320, 160);
+        let noisy: Vec<u8> = (0..width * height * 3).map(|i| ((i * 2_654_435_761_usize) >> 7) as u8 / 2).collect();
+        for pixels in [noisy, gradient(width, height), vec![90; width * height * 3]] {
+            for (scans, restart) in [(2, 0), (4, 0), (10, 0), (4, 7)] {
+                let mut whole = Vec::new();
+                let mut encoder = jpeg_encoder::Encoder::new(&mut whole, 90);
+                encoder.set_progressive_scans(scans);
+                if restart > 0 {
+                    encoder.set_restart_interval(restart);
+                }
+                encoder.encode(&pixels, width as u16, height as u16, jpeg_encoder::ColorType::Rgb).unwrap();
+                let mut image = RgbImage::default();
+                assert_eq!(decode_rgb(&whole, &mut image), Ok(()));
+                assert_eq!((image.height, image.width), (height, width));
+                assert_eq!(decode_rgb(&[&whole[..], &[0; 500]].concat(), &mut image), Ok(()));
+                let begin = (2..whole.len()).find(|&i| whole[i..].starts_with(&[0xff, 0xda])).unwrap();
+                let end = Scan::of(&whole).unwrap().end;
+                // The last bytes of the last pass may be those of the last block.
+                for at in (0..60).map(|part| begin + (end - begin) * part / 60) {
+                    for marker in [&b""[..], b"\xff\xd9"] {
+                        let cut = [&whole[..at], marker].concat();
+                        assert!(
+                            decode_rgb(&cut, &mut image).is_err(),
+                            "{at} of {end} bytes, {scans} scans, {marker:?}"
+                        );
                     }
                 }
             }

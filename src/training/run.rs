@@ -19,7 +19,8 @@ use super::validation::{Validation, ValidationResult};
 use crate::dataset::Description;
 use crate::dataset::held_out::held_out_tracks;
 use crate::dataset::loader::{Batch, Loader};
-use crate::engine::network::{Network, Parameters, StepInput, TrainingPlan};
+use crate::engine::loss::{PairTerms, Smoothness};
+use crate::engine::network::{Network, PAIRS_CAPACITY, Parameters, StepInput, TrainingPlan};
 use crate::engine::optimizer::{Optimizer, WeightAverage};
 use crate::engine::stopwatch::Stopwatch;
 use crate::error::{Error, Result};
@@ -271,6 +272,8 @@ struct TrainingRun {
     network: Network,
     plan: TrainingPlan,
     training: Loader,
+    /// The terms of the loss for pairs, if the recipe has any.
+    smoothness: Option<Smoothness>,
     training_rows: Vec<u64>,
     validation: Option<Validation>,
     leak_percent: f64,
@@ -306,12 +309,27 @@ impl TrainingRun {
             }
             None => network.initialize(info.seed),
         };
-        let (training, validation) = data.into_loaders()?;
+        let (mut training, validation) = data.into_loaders()?;
+        let smoothness = recipe.smoothness.filter(|smoothness| !smoothness.is_off());
+        if let Some(smoothness) = &smoothness {
+            let (neighbours, images) = (training.pair_up(smoothness), training.images());
+            if smoothness.temporal > 0.0 && neighbours * 2 < images {
+                notices.push(format!(
+                    "[smoothness] temporal: {neighbours} of {images} training images have a neighbour within 0.25 s"
+                ));
+            }
+        }
         // No batch is larger than a side has samples, whatever the recipe asks for.
         let most = training.samples().max(validation.as_ref().map_or(0, Loader::samples));
         let capacity = recipe.batch.min(most).max(MAX_ROW_IMAGES);
+        let plan_capacity = match smoothness {
+            // Each sample may bring a partner.
+            Some(_) => recipe.batch.min(2 * most).max(capacity).next_multiple_of(PAIRS_CAPACITY),
+            None => capacity,
+        };
         Ok(TrainingRun {
-            plan: TrainingPlan::new(&network, capacity),
+            plan: TrainingPlan::new(&network, plan_capacity),
+            smoothness,
             validation: validation.map(|loader| Validation::new(loader, &network, capacity, recipe.full_lock_deg)),
             state: State {
                 average: recipe.averaging.map(|spec| WeightAverage::new(spec, &parameters, network.isa())),
@@ -427,6 +445,7 @@ impl TrainingRun {
             let step = u64::from(epoch) * batches as u64 + batch as u64;
             let State { parameters, optimizer, average, progress, .. } = &mut self.state;
             let (network, plan, loss) = (&self.network, &mut self.plan, &self.recipe.loss);
+            let pairs = self.smoothness.map_or_else(PairTerms::default, |terms| PairTerms::new(&terms, current.pairs));
             // The next batch is loaded while the network trains on this one.
             let ((mean_loss, step_done), filled) = rayon::join(
                 || {
@@ -435,7 +454,7 @@ impl TrainingRun {
                     }
                     let (x, labels) = (images(network.input(), current), ArrayView1::from(&current.labels));
                     let input = StepInput { x, labels, seed: self.info.seed, step };
-                    (plan.step(network, parameters, loss, input), Instant::now())
+                    (plan.step_with_pairs(network, parameters, loss, &pairs, input), Instant::now())
                 },
                 || if following < batches { training.fill(following, next) } else { Ok(()) },
             );

@@ -51,9 +51,9 @@ impl Validation {
         self.plan.measure(evaluation);
     }
 
-    /// Number of images, each mirrored one counted too.
+    /// Number of images without those that could not be decoded so far, each mirrored one counted too.
     pub fn images(&self) -> usize {
-        self.loader.samples()
+        self.loader.samples_used()
     }
 
     /// Images that could not be decoded so far: their number, and the first few with their paths.

@@ -2,7 +2,7 @@
 
 use super::{Failures, isas, nans, numbers};
 use steersman_kernels::update::AdamStep;
-use steersman_kernels::{activation, norm, pixels, pool, reference, update};
+use steersman_kernels::{activation, blur, norm, pixels, pool, reference, update};
 
 /// Lengths around the vector widths.
 const LENGTHS: &[usize] = &[0, 1, 3, 4, 5, 15, 16, 17, 31, 100, 1027];
@@ -135,6 +135,14 @@ fn pooling_agrees_with_the_loops() {
                 reference::average_forward(&shape, n, &x, &mut expected);
                 pool::average_forward(isa, &shape, n, &x, &mut actual);
                 failures.compare(&format!("average_forward {what}"), &actual, &expected, 1e-6);
+                let (mut expected, mut actual, mut row) = (nans(n * y_len), nans(n * y_len), nans(w));
+                reference::blur_forward(&shape, n, &x, &mut expected);
+                blur::blur_forward(isa, &shape, n, &x, &mut actual, &mut row);
+                failures.compare(&format!("blur_forward {what}"), &actual, &expected, 1e-6);
+                let (mut expected, mut actual, mut row) = (nans(n * x_len), nans(n * x_len), nans(w));
+                reference::blur_backward(&shape, n, &dy, &mut expected);
+                blur::blur_backward(isa, &shape, n, &dy, &mut actual, &mut row);
+                failures.compare(&format!("blur_backward {what}"), &actual, &expected, 1e-6);
                 let (mut expected, mut actual) = (nans(n * x_len), nans(n * x_len));
                 reference::average_backward(&shape, n, &dy, &mut expected);
                 pool::average_backward(isa, &shape, n, &dy, &mut actual);
@@ -221,11 +229,15 @@ fn updates_agree_with_the_loops() {
             let (grads, v) = (numbers(2, len), numbers(4, len).iter().map(|v| v.abs()).collect::<Vec<_>>());
             let mut expected = [numbers(1, len), numbers(3, len), v];
             let mut actual = expected.clone();
-            let [p, m, v] = &mut expected;
-            reference::adam(&step, p, &grads, m, v);
-            let [p, m, v] = &mut actual;
-            update::adam(isa, &step, p, &grads, m, v);
-            failures.compare(&format!("adam {what}"), &actual.concat(), &expected.concat(), 1e-6);
+            // A large epsilon tells whether it stands outside the root.
+            for epsilon in [1e-7, 0.3] {
+                let step = AdamStep { epsilon, ..step };
+                let [p, m, v] = &mut expected;
+                reference::adam(&step, p, &grads, m, v);
+                let [p, m, v] = &mut actual;
+                update::adam(isa, &step, p, &grads, m, v);
+                failures.compare(&format!("adam {what}, {epsilon}"), &actual.concat(), &expected.concat(), 2e-6);
+            }
 
             let mut expected = [numbers(1, len), numbers(3, len)];
             let mut actual = expected.clone();

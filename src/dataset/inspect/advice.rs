@@ -1,8 +1,9 @@
 //! What to do about what was found, in plain words.
 
 use super::suspicious::Suspicion;
-use super::{Pictures, Report, Steering};
+use super::{Pictures, Report, Steering, Treatment};
 use crate::dataset::recording::View;
+use crate::dataset::samples::Flip;
 use crate::dataset::unusable::Reason;
 
 /// Share of labels that are exactly zero above which straight frames crowd out the bends.
@@ -22,14 +23,14 @@ const MUCH_STANDING: f64 = 0.01;
 /// A picture follows its label by this much, in milliseconds, where both belong together.
 const USUAL_LAG_MS: std::ops::RangeInclusive<f64> = -60.0..=250.0;
 
-/// What to do, the weightiest first.
-pub fn advice(report: &Report) -> Vec<String> {
+/// What to do before training that does what `treatment` says, the weightiest first.
+pub fn advice(report: &Report, treatment: &Treatment) -> Vec<String> {
     let mut advice = Vec::new();
     advice.extend(about_unusable(report));
     if let Some(steering) = &report.steering {
-        about_labels(report.format_cameras > 1, steering, &mut advice);
+        about_labels(report.format_cameras > 1, steering, treatment, &mut advice);
     }
-    about_rows(report, &mut advice);
+    about_rows(report, treatment, &mut advice);
     if let Some(pictures) = &report.pictures {
         about_pictures(pictures, &mut advice);
     }
@@ -62,7 +63,7 @@ fn about_unusable(report: &Report) -> impl Iterator<Item = String> + '_ {
     })
 }
 
-fn about_labels(simulated: bool, steering: &Steering, advice: &mut Vec<String>) {
+fn about_labels(simulated: bool, steering: &Steering, treatment: &Treatment, advice: &mut Vec<String>) {
     let zeros = steering.zero_share;
     let rows: usize = steering.histogram.iter().sum();
     if zeros > 0.99 {
@@ -72,7 +73,11 @@ fn about_labels(simulated: bool, steering: &Steering, advice: &mut Vec<String>) 
         );
         return;
     }
-    if zeros > MANY_ZEROS {
+    let Treatment { samples, balance } = treatment;
+    // What is left of them after the thinning of the recipe.
+    let zeros_kept = zeros * balance.keep_zero.unwrap_or(1.0);
+    let thinned = balance.histogram_max.is_some() || zeros_kept <= MANY_ZEROS * (1.0 - zeros + zeros_kept);
+    if zeros > MANY_ZEROS && !thinned {
         let keep = ZEROS_LEFT / (1.0 - ZEROS_LEFT) * (1.0 - zeros) / zeros;
         let keep = (20.0 * keep).round().max(1.0) / 20.0;
         advice.push(format!(
@@ -83,7 +88,7 @@ fn about_labels(simulated: bool, steering: &Steering, advice: &mut Vec<String>) 
     }
     let (left, right) = (steering.left_share, steering.right_share);
     let turns = left + right;
-    if turns > 0.01 && left.min(right) < RARE_SIDE * turns {
+    if turns > 0.01 && left.min(right) < RARE_SIDE * turns && samples.flip == Flip::None {
         let side = if left > right { "left" } else { "right" };
         let share = 100.0 * left.max(right) / turns;
         let only = if share > 99.5 {
@@ -107,14 +112,15 @@ fn about_labels(simulated: bool, steering: &Steering, advice: &mut Vec<String>) 
     }
 }
 
-fn about_rows(report: &Report, advice: &mut Vec<String>) {
+fn about_rows(report: &Report, treatment: &Treatment, advice: &mut Vec<String>) {
     if report.usable > 0 && report.usable < FEW_ROWS {
         advice.push(format!(
             "{} rows are few: record more laps, in both directions, and ways back from the edge of the road",
             report.usable
         ));
     }
-    if let Some(share) = report.standing_share.filter(|share| *share > MUCH_STANDING) {
+    let standing = report.standing_share.filter(|share| *share > MUCH_STANDING);
+    if let Some(share) = standing.filter(|_| treatment.samples.min_throttle.is_none()) {
         advice.push(format!(
             "{:.0} % of the rows stand still: leave them out, with --set samples.min_throttle=0 or by hand",
             100.0 * share
@@ -154,12 +160,37 @@ fn about_pictures(pictures: &Pictures, advice: &mut Vec<String>) {
 
 #[cfg(test)]
 mod tests {
-    use super::super::describe;
+    use super::super::describe::describe;
+    use super::*;
+    use crate::dataset::samples::Balance;
     use crate::dataset::testing::recording_of;
     use std::path::Path;
 
     fn advice(labels: &[f32]) -> Vec<String> {
-        describe(Path::new("x"), &recording_of(labels, 100), &[]).advice
+        advice_for(labels, &Treatment::default())
+    }
+
+    fn advice_for(labels: &[f32], treatment: &Treatment) -> Vec<String> {
+        describe(Path::new("x"), &recording_of(labels, 100), &[], treatment).advice
+    }
+
+    #[test]
+    fn nothing_is_advised_that_the_recipe_does_already() {
+        // Two thirds are zeros, the rest turns left.
+        let labels: Vec<f32> = (0..6000).map(|i| if i % 3 == 0 { -0.1 - i as f32 * 1e-4 } else { 0.0 }).collect();
+        let found = advice(&labels);
+        assert!(found[0].contains("balance.keep_zero") && found[1].contains("samples.flip"), "{found:?}");
+        let mut treatment = Treatment::default();
+        treatment.samples.flip = Flip::Both;
+        let found = advice_for(&labels, &treatment);
+        assert!(found.len() == 1 && found[0].contains("balance.keep_zero"), "{found:?}");
+        // 4000 zeros thinned to 1000 stand beside 2000 others, thinned to 3600 they are still too many.
+        treatment.balance.keep_zero = Some(0.25);
+        assert_eq!(advice_for(&labels, &treatment), Vec::<String>::new());
+        treatment.balance.keep_zero = Some(0.9);
+        assert_eq!(advice_for(&labels, &treatment).len(), 1);
+        treatment.balance = Balance { histogram_bins: Some(21), histogram_max: Some(100), ..Balance::default() };
+        assert_eq!(advice_for(&labels, &treatment), Vec::<String>::new());
     }
 
     #[test]

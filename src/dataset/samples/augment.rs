@@ -2,7 +2,7 @@
 //! Validation and driving never see them.
 //!
 //! They act on the RGB stage of preprocessing (cropped, before the colour conversion), in this order: view, shift, shadows,
-//! lines, colours, brightness. Each is drawn anew for every sample and epoch.
+//! lines, colours, brightness, block noise. Each is drawn anew for every sample and epoch.
 
 use super::spec::Correction;
 use crate::dataset::pictures::preprocess::Preprocessing;
@@ -81,6 +81,15 @@ pub struct Augmentation {
     /// Range of the factor of the distance from the picture's mean grey level.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub contrast: Option<[f64; 2]>,
+    /// Noise like a JPEG's, which changes from frame to frame: an error of each block of 8x8 source pixels in the three coarsest
+    /// coefficients of its cosine transform, in brightness. Each error is drawn up to an amplitude in grey levels, and the amplitude of a
+    /// picture between 0 and this.
+    #[serde(skip_serializing_if = "is_zero")]
+    pub block_noise: f64,
+}
+
+fn is_zero(number: &f64) -> bool {
+    *number == 0.0
 }
 
 impl Default for Augmentation {
@@ -99,6 +108,7 @@ impl Default for Augmentation {
             saturation: None,
             tint: None,
             contrast: None,
+            block_noise: 0.0,
         }
     }
 }
@@ -112,6 +122,7 @@ impl Augmentation {
             || self.shadow_probability > 0.0
             || self.shift_px > 0.0
             || self.lines > 0
+            || self.block_noise > 0.0
             || self.changes_colours()
     }
 
@@ -139,6 +150,9 @@ impl Augmentation {
         }
         if self.lines > 100 {
             return wrong("lines", "must be 0 to 100");
+        }
+        if !(0.0..=64.0).contains(&self.block_noise) {
+            return wrong("block_noise", "must be 0 to 64 grey levels");
         }
         if !(0.0..=180.0).contains(&self.hue_deg) {
             return wrong("hue_deg", "must be 0 to 180");
@@ -220,6 +234,14 @@ impl Augmentation {
             let table = factors(uniform(rng, low, high));
             rgb.iter_mut().for_each(|grey| *grey = table[usize::from(*grey)]);
         }
+        if self.block_noise > 0.0 {
+            let amplitude = uniform(rng, 0.0, self.block_noise);
+            let source_rows_per_row =
+                (preprocessing.rows[1] - preprocessing.rows[0]) as f64 / preprocessing.rgb_size()[0] as f64;
+            let side = |source_px: f64| (8.0 / source_px).round().max(1.0) as usize;
+            let block = [side(source_rows_per_row), side(preprocessing.source_px_per_rgb_px())];
+            block_noise(rgb, width, block, amplitude, rng);
+        }
         moved_px
     }
 }
@@ -227,6 +249,28 @@ impl Augmentation {
 /// Grey levels times `factor`, rounded and clamped.
 fn factors(factor: f64) -> [u8; 256] {
     std::array::from_fn(|grey| (grey as f64 * factor).round().min(255.0) as u8)
+}
+
+/// Adds an error to each block of `block` (height, width) pixels: constant, and a half wave along each axis, each of up to `amplitude`
+/// grey levels.
+fn block_noise(rgb: &mut [u8], width: usize, block: [usize; 2], amplitude: f64, rng: &mut impl Rng) {
+    let rows = rgb.len() / (width * 3);
+    let wave = |at: usize, side: usize| (std::f64::consts::PI * (at as f64 + 0.5) / side as f64).cos();
+    for top in (0..rows).step_by(block[0]) {
+        for left in (0..width).step_by(block[1]) {
+            let [constant, down, along] = [(); 3].map(|()| uniform(rng, -amplitude, amplitude));
+            for y in top..rows.min(top + block[0]) {
+                let of_row = constant + down * wave(y - top, block[0]);
+                for x in left..width.min(left + block[1]) {
+                    // Half a grey level more, as the conversion to bytes cuts off.
+                    let error = (of_row + along * wave(x - left, block[1]) + 0.5) as f32;
+                    for grey in &mut rgb[(y * width + x) * 3..][..3] {
+                        *grey = (f32::from(*grey) + error) as u8;
+                    }
+                }
+            }
+        }
+    }
 }
 
 /// Moves the picture `columns` to the right (to the left if negative) and repeats the edge column.
@@ -466,6 +510,38 @@ mod tests {
         assert!(reaches(|o| o.right_m) > 0.98 && reaches(|o| -o.turn) > 0.1);
         let always: ViewSpec = toml::from_str("offset_m = 1.0\nturn_deg = 6.0").unwrap();
         assert!((0..100).all(|stream| always.draw(&mut rng(3, Purpose::View, 0, stream)).is_some()));
+    }
+
+    #[test]
+    fn block_noise_is_grey_changes_from_block_to_block_and_has_the_amplitude_that_was_asked_for() {
+        // Blocks of 8x8 source pixels are 4x4 pixels of the stage.
+        let preprocessing = Preprocessing { source: [16, 40], rows: [0, 16], resize: [8, 20], ..Default::default() };
+        let noise: Augmentation = toml::from_str("block_noise = 6").unwrap();
+        assert!(noise.is_active() && noise.validate().is_ok());
+        let (mut sum, mut largest, mut count) = (0.0, 0.0f64, 0);
+        for stream in 0..500 {
+            let mut rgb = vec![100; 8 * 20 * 3];
+            assert_eq!(noise.apply(&preprocessing, &mut rgb, &mut rng(5, Purpose::Test, 0, stream)), 0.0);
+            for (k, px) in rgb.chunks_exact(3).enumerate() {
+                assert!(px[0] == px[1] && px[1] == px[2], "brightness alone");
+                let error = f64::from(px[0]) - 100.0;
+                (sum, largest, count) = (sum + error, largest.max(error.abs()), count + 1);
+                // Within a block neighbours in a row differ by at most 2 cos(3 pi/8) = 0.77 of the amplitude, and by rounding.
+                if k % 4 > 0 {
+                    assert!((f64::from(px[0]) - f64::from(rgb[3 * k - 3])).abs() <= 6.0 * 0.77 + 1.0);
+                }
+            }
+        }
+        assert!((sum / f64::from(count)).abs() < 0.1, "no brighter, no darker on average");
+        // Up to 6 · (1 + 2 cos(pi/8)) grey levels, where all three errors are as large as can be.
+        assert!((8.0..=18.0).contains(&largest), "{largest}");
+        assert!(
+            Augmentation { block_noise: -1.0, ..noise }.validate().unwrap_err().to_string().contains("block_noise")
+        );
+        // Black and white are held.
+        let mut rgb = [0, 255].repeat(12);
+        block_noise(&mut rgb, 4, [4, 4], 60.0, &mut rng(1, Purpose::Test, 0, 0));
+        assert!(rgb.contains(&0) || rgb.contains(&255));
     }
 
     #[test]

@@ -32,11 +32,14 @@ pub struct LabelSpec {
     pub look_ahead_s: f64,
     /// But never nearer than this, wheelbases.
     pub min_wheelbases: f64,
+    /// Each row takes the label of this time later in its session, s, interpolated between rows: the model then answers what will be
+    /// needed when the wheels act, for cars with latency. Rows at the end of a session have no label then.
+    pub shift_s: f64,
 }
 
 impl Default for LabelSpec {
     fn default() -> Self {
-        Self { kind: LabelKind::Wheel, look_ahead_s: 0.7, min_wheelbases: 2.0 }
+        Self { kind: LabelKind::Wheel, look_ahead_s: 0.7, min_wheelbases: 2.0, shift_s: 0.0 }
     }
 }
 
@@ -56,6 +59,9 @@ impl LabelSpec {
         }
         if !(0.5..=100.0).contains(&self.min_wheelbases) {
             return Err(Error::Usage("labels.min_wheelbases: must be 0.5 to 100".into()));
+        }
+        if !(0.0..=5.0).contains(&self.shift_s) {
+            return Err(Error::Usage("labels.shift_s: must be 0 to 5 s".into()));
         }
         Ok(())
     }
@@ -117,6 +123,9 @@ impl Targets {
                 targets.add_driven(recording, spec);
             } else {
                 targets.recordings.push(OfRecording { labels: steering(recording), geometry: None });
+            }
+            if let Some(of) = targets.recordings.last_mut().filter(|_| spec.shift_s > 0.0) {
+                of.labels = later(recording, &of.labels, spec.shift_s);
             }
         }
         targets
@@ -222,6 +231,30 @@ pub(super) fn chained(first: Offset, then: Offset) -> Offset {
     Pose::default().offset_to(Pose::default().displaced(first).displaced(then))
 }
 
+/// The labels `shift_s` later in the session of each row, between rows by linear interpolation; NaN beyond its end.
+fn later(recording: &Recording, labels: &[f32], shift_s: f64) -> Vec<f32> {
+    let mut shifted = vec![f32::NAN; labels.len()];
+    for session in &recording.sessions {
+        let time_ms = |row: usize| recording.rows[row].time_ms as f64;
+        let mut after = session.start;
+        for row in session.clone() {
+            let wanted_ms = time_ms(row) + 1000.0 * shift_s;
+            while after < session.end && time_ms(after) < wanted_ms {
+                after += 1;
+            }
+            if after == session.end {
+                break;
+            }
+            // `after` is behind `row`, as the shift is positive.
+            let (from_ms, to_ms) = (time_ms(after - 1), time_ms(after));
+            let share = (wanted_ms - from_ms) / (to_ms - from_ms);
+            let (from, to) = (f64::from(labels[after - 1]), f64::from(labels[after]));
+            shifted[row] = if share == 1.0 { labels[after] } else { (from + share * (to - from)) as f32 };
+        }
+    }
+    shifted
+}
+
 fn steering(recording: &Recording) -> Vec<f32> {
     recording.rows.iter().map(|row| row.steering).collect()
 }
@@ -261,6 +294,29 @@ mod tests {
         assert_eq!((wheel.label(item(15)), wheel.label(item(58))), (Some(0.0), Some(0.5)));
         assert_eq!(wheel.beside(item(3), Offset { right_m: 1.0, ..Offset::default() }), 0.0);
         assert!(targets.notices()[0].contains("`udacity` is assumed") && wheel.notices().is_empty());
+    }
+
+    #[test]
+    fn shifted_labels_are_those_of_later_and_stay_in_their_session() {
+        // Two sessions at 10 Hz.
+        let mut recordings = [recording_of(&[0.0, 0.1, 0.3, 0.7, -0.5, -0.4, -0.2], 100)];
+        recordings[0].sessions = vec![0..4, 4..7];
+        let shifted = |shift_s| {
+            let spec = LabelSpec { shift_s, ..LabelSpec::default() };
+            let targets = Targets::of(&recordings, &spec, &SampleSpec::default(), &Augmentation::default());
+            (0..7).map(|row| targets.label(item(row))).collect::<Vec<_>>()
+        };
+        let now = [0.0, 0.1, 0.3, 0.7, -0.5, -0.4, -0.2].map(Some);
+        assert_eq!(shifted(0.0), now);
+        assert_eq!(shifted(0.1), [Some(0.1), Some(0.3), Some(0.7), None, Some(-0.4), Some(-0.2), None]);
+        let between = shifted(0.15);
+        for (label, expected) in between.iter().zip([Some(0.2), Some(0.5), None, None, Some(-0.3), None, None]) {
+            assert_eq!(label.is_some(), expected.is_some(), "{between:?}");
+            assert!((label.unwrap_or(0.0) - expected.unwrap_or(0.0)).abs() < 1e-6, "{between:?}");
+        }
+        assert!(
+            LabelSpec { shift_s: -0.1, ..LabelSpec::default() }.validate().unwrap_err().to_string().contains("shift_s")
+        );
     }
 
     #[test]

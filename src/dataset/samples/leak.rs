@@ -11,6 +11,7 @@ use super::Item;
 use super::split::Split;
 use crate::dataset::recording::Recording;
 use crate::picture::RgbImage;
+use crate::text::percent;
 use rayon::prelude::*;
 use serde::Serialize;
 
@@ -65,8 +66,8 @@ impl LeakAudit {
 
     /// The audit in words.
     pub fn summary(&self) -> String {
-        let percent = 100.0 * self.share();
-        format!("leak audit: {percent:.1} % of the validation rows have a training row within 1 s in the same session")
+        let percent = percent(100.0 * self.share());
+        format!("leak audit: {percent} % of the validation rows have a training row within 1 s in the same session")
     }
 }
 
@@ -145,9 +146,9 @@ impl NearTwins {
 
     /// The count in words.
     pub fn summary(&self) -> String {
-        let percent = 100.0 * self.share();
+        let percent = percent(100.0 * self.share());
         format!(
-            "leak audit: {percent:.1} % of the validation frames (centre camera) are nearly identical to a training frame \
+            "leak audit: {percent} % of the validation frames (centre camera) are nearly identical to a training frame \
              (mean difference below {TWIN_LEVELS} grey levels at {}x{} cells)",
             CELLS[0], CELLS[1]
         )
@@ -184,6 +185,7 @@ mod tests {
         let training: Vec<&Thumbnail> = frames[..10].iter().collect();
         let validation = [&noisy, &frames[15], &frames[7]];
         assert_eq!(NearTwins::count(&validation, &training), NearTwins { frames: 3, twins: 2 });
+        assert!(NearTwins { frames: 5000, twins: 1 }.summary().contains(": <0.1 % of the validation frames"));
         assert_eq!(NearTwins::count(&validation, &[]).twins, 0);
         assert_eq!(NearTwins::count(&[], &training).share(), 0.0);
     }

@@ -6,11 +6,13 @@
 
 use super::augment::Augmentation;
 use super::leak::{NearTwins, Thumbnail};
+use super::pairs::{Pairing, Wanted};
 use super::split::Split;
 use super::{Flip, Group, Item, Mirror, SampleSpec, Targets};
 use crate::dataset::pictures::cache::{CacheSpec, ImageCache};
 use crate::dataset::pictures::preprocess::{Preprocessing, Preprocessor};
 use crate::dataset::recording::{Recording, View};
+use crate::engine::loss::{Pairs, Smoothness};
 use crate::engine::random::{Purpose, rng, shuffle, unit};
 use crate::engine::stopwatch::Stopwatch;
 use crate::picture::{RgbImage, decode::decode_rgb};
@@ -62,8 +64,10 @@ pub struct Batch {
     pub n: usize,
     /// Where each sample comes from, `[n]`.
     pub samples: Vec<SampleId>,
-    /// Sample numbers of the loader and whether they could be decoded; kept to be used again.
-    work: Vec<(u32, bool)>,
+    /// The pairs among its first samples.
+    pub pairs: Pairs,
+    /// What it is to hold; kept to be used again.
+    work: Vec<Wanted>,
 }
 
 /// Makes the batches of one side of a split.
@@ -82,6 +86,7 @@ pub struct Loader {
     first_images: Vec<u32>,
     /// What is taken in this order: samples, or items with [`Group::Rows`].
     order: Vec<u32>,
+    pairing: Option<Pairing>,
     epoch: u64,
     cache: ImageCache,
     thumbnails: Vec<OnceLock<Thumbnail>>,
@@ -198,6 +203,7 @@ impl Loader {
             images,
             first_images,
             order: Vec::new(),
+            pairing: None,
             epoch: 0,
             undecodable: Mutex::default(),
             scratch: Mutex::default(),
@@ -206,6 +212,16 @@ impl Loader {
         };
         loader.begin_epoch(0);
         Ok(loader)
+    }
+
+    /// Lets batches hold the pairs of `smoothness` from now on. Returns the number of images that have a neighbour in time.
+    ///
+    /// # Panics
+    /// If whole rows are grouped.
+    pub fn pair_up(&mut self, smoothness: &Smoothness) -> usize {
+        assert!(self.spec.samples.group == Group::Images, "pairs are made of single images");
+        let pairing = Pairing::new(smoothness, self.spec.batch, &self.recordings, &self.items, &self.images);
+        self.pairing.insert(pairing).with_neighbour()
     }
 
     /// Adds the time that samples take from now on to `times`.
@@ -225,7 +241,9 @@ impl Loader {
 
     /// Number of batches in an epoch.
     pub fn batches(&self) -> usize {
-        self.order.len().div_ceil(self.per_batch())
+        // With pairs, an epoch has as many batches as without.
+        let per_batch = if self.pairing.is_some() { self.spec.batch } else { self.per_batch() };
+        self.order.len().div_ceil(per_batch)
     }
 
     /// Shape of a sample: channels, height, width.
@@ -260,12 +278,14 @@ impl Loader {
         let taken = &self.order[batch * per_batch..self.order.len().min((batch + 1) * per_batch)];
         let variants = self.variants() as u32;
         out.work.clear();
-        match self.spec.samples.group {
-            Group::Images => out.work.extend(taken.iter().map(|&sample| (sample, false))),
-            Group::Rows => {
+        out.pairs = Pairs::default();
+        match (self.spec.samples.group, &self.pairing) {
+            (Group::Images, None) => out.work.extend(taken.iter().map(|&sample| Wanted::single(sample))),
+            (Group::Images, Some(pairing)) => out.pairs = pairing.lay_out(taken, variants, &mut out.work),
+            (Group::Rows, _) => {
                 for &item in taken {
                     let images = self.first_images[item as usize]..self.first_images[item as usize + 1];
-                    out.work.extend((images.start * variants..images.end * variants).map(|sample| (sample, false)));
+                    out.work.extend((images.start * variants..images.end * variants).map(Wanted::single));
                 }
             }
         }
@@ -274,9 +294,9 @@ impl Loader {
         out.x.resize(out.n * len, 0.0);
         out.labels.resize(out.n, 0.0);
         let samples = out.x.par_chunks_exact_mut(len).zip(&mut out.labels).zip(&mut out.work);
-        samples.try_for_each(|((x, label), (sample, decoded))| -> Result<()> {
-            let made = self.with_scratch(|scratch| self.make_sample(*sample, x, scratch))??;
-            (*label, *decoded) = (made.unwrap_or(0.0), made.is_some());
+        samples.try_for_each(|((x, label), wanted)| -> Result<()> {
+            let made = self.with_scratch(|scratch| self.make_sample(wanted, x, scratch))??;
+            (*label, wanted.decoded) = (made.unwrap_or(0.0), made.is_some());
             Ok(())
         })?;
         self.close_gaps(out);
@@ -314,7 +334,7 @@ impl Loader {
     /// How many entries of `order` make a batch.
     fn per_batch(&self) -> usize {
         match self.spec.samples.group {
-            Group::Images => self.spec.batch,
+            Group::Images => self.pairing.as_ref().map_or(self.spec.batch, |pairing| pairing.leaders(self.spec.batch)),
             Group::Rows => {
                 let cameras = self.first_images.windows(2).map(|pair| pair[1] - pair[0]).max().unwrap_or(1);
                 (self.spec.batch / (cameras as usize * self.variants()).max(1)).max(1)
@@ -322,6 +342,7 @@ impl Loader {
         }
     }
 
+    /// Whether a sample that takes the random numbers of `sample` is mirrored.
     fn is_mirrored(&self, sample: u32) -> bool {
         match self.flip {
             Flip::None => false,
@@ -334,14 +355,18 @@ impl Loader {
         lock(&self.undecodable).insert(image, message);
     }
 
-    /// Moves samples up to where others could not be decoded, and notes where the rest come from.
+    /// Moves samples up to where others could not be decoded, and notes where the rest come from. A pair goes as a whole.
     fn close_gaps(&self, out: &mut Batch) {
         let len = self.spec.preprocessing.output_len();
         let mut n = 0;
         out.samples.clear();
+        let pairs = out.pairs;
         for i in 0..out.n {
-            let (sample, decoded) = out.work[i];
-            if !decoded {
+            let Wanted { sample, draws, decoded, .. } = out.work[i];
+            let is_paired = i < pairs.images();
+            if !decoded || (is_paired && !out.work[i ^ 1].decoded) {
+                let of_kind = if i < 2 * pairs.spatial { &mut out.pairs.spatial } else { &mut out.pairs.temporal };
+                *of_kind -= usize::from(is_paired && i % 2 == 0);
                 continue;
             }
             if n < i {
@@ -350,7 +375,7 @@ impl Loader {
             }
             let (item, camera) = self.images[sample as usize / self.variants()];
             let Item { recording, row, .. } = self.items[item as usize];
-            out.samples.push(SampleId { recording, row, camera, mirrored: self.is_mirrored(sample) });
+            out.samples.push(SampleId { recording, row, camera, mirrored: self.is_mirrored(draws) });
             n += 1;
         }
         out.n = n;

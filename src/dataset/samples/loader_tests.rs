@@ -341,3 +341,74 @@ fn near_twins_are_found_after_an_epoch() {
     assert!(twins.share() < 0.5, "{twins:?}");
     assert_eq!(training.near_twins(&training).share(), 1.0);
 }
+
+/// Every batch of an epoch begins with pairs as `smoothness` says; returns how many of each kind there are, and the samples.
+fn assert_pairs(loader: &mut Loader, smoothness: &Smoothness) -> ([usize; 2], usize) {
+    let mut batch = Batch::default();
+    let (len, mut found, mut samples) = (loader.spec.preprocessing.output_len(), [0, 0], 0);
+    let mut changed = 0;
+    for k in 0..loader.batches() {
+        loader.fill(k, &mut batch).unwrap();
+        let Pairs { spatial, temporal } = batch.pairs;
+        let most = smoothness.pairs(loader.spec.batch);
+        assert!(batch.n <= loader.spec.batch && spatial <= most.spatial && temporal <= most.temporal);
+        assert!(2 * (spatial + temporal) <= batch.n);
+        for pair in 0..spatial + temporal {
+            let [a, b] = [2 * pair, 2 * pair + 1];
+            let ([x_a, x_b], [s_a, s_b]) =
+                ([a, b].map(|i| &batch.x[i * len..][..len]), [batch.samples[a], batch.samples[b]]);
+            let steering = |s: SampleId| loader.recordings[0].rows[s.row as usize].steering;
+            let sign = if s_a.mirrored { -1.0 } else { 1.0 };
+            let asked = batch.labels[a] - batch.labels[b] - sign * (steering(s_a) - steering(s_b));
+            if pair < spatial {
+                assert_eq!(s_a, s_b);
+                // Shifts by whole columns of two pixels: the labels tell how far they lie apart.
+                assert!((asked / 0.02 - (asked / 0.02).round()).abs() < 1e-3);
+                changed += usize::from(x_a != x_b);
+            } else {
+                assert_eq!((s_a.camera, s_a.mirrored), (s_b.camera, s_b.mirrored));
+                assert_eq!(s_a.row.abs_diff(s_b.row), 1);
+                assert!(asked.abs() < 1e-5, "one shift for both: {asked}");
+                assert_ne!(x_a, x_b);
+            }
+        }
+        found = [found[0] + spatial, found[1] + temporal];
+        samples += batch.n;
+    }
+    assert!(changed * 10 >= found[0] * 9, "{changed} of {} spatial pairs differ", found[0]);
+    (found, samples)
+}
+
+#[test]
+fn batches_hold_pairs_of_one_image_and_of_neighbours() {
+    let folder = tempfile::tempdir().unwrap();
+    let recordings = recordings(folder.path(), 150);
+    let none = SplitSpec { validation_share: 0.0, ..Default::default() };
+    let spec = LoaderSpec { batch: 20, ..augmented() };
+    let targets = targets(&recordings, &spec);
+    let split = split(&recordings, &targets, &none, &spec.samples, &Balance::default(), 0).unwrap();
+    let load = || Loader::training(&recordings, &targets, &split, &spec).unwrap();
+    let batches = load().batches();
+    assert_eq!(batches, 45);
+    for (spatial, temporal, found) in [(1.0, 1.0, [3, 2]), (0.5, 0.0, [5, 0]), (0.0, 2.0, [0, 5])] {
+        let smoothness = Smoothness { spatial, temporal, ..Smoothness::default() };
+        let mut loader = load();
+        assert_eq!(loader.pair_up(&smoothness), 450, "every image has a neighbour");
+        assert_eq!((loader.batches(), loader.samples()), (batches, 900), "an epoch is as long as without pairs");
+        assert_eq!(assert_pairs(&mut loader, &smoothness), (found.map(|count| count * batches), 900));
+        let with = |threads| {
+            let mut loader = load();
+            loader.pair_up(&smoothness);
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| epochs(&mut loader))
+        };
+        assert_eq!(with(1), with(3));
+    }
+    // A pair with a broken picture goes as a whole.
+    fs::write(recordings[0].image_path(70, View::Left).unwrap(), b"\xff\xd8 no picture \xff\xd9").unwrap();
+    let smoothness = Smoothness { pairs_share: 1.0, spatial: 1.0, temporal: 1.0 };
+    let mut loader = load();
+    loader.pair_up(&smoothness);
+    let (found, samples) = assert_pairs(&mut loader, &smoothness);
+    assert!(samples < 900 && samples % 2 == 0 && found[0] + found[1] == samples / 2, "{found:?}, {samples}");
+}

@@ -5,6 +5,7 @@ mod balance;
 mod labels;
 pub mod leak;
 pub mod loader;
+mod pairs;
 mod spec;
 pub mod split;
 

@@ -34,6 +34,7 @@
 
 mod activation;
 mod batch_norm;
+mod blur;
 mod conv2d;
 mod crop;
 mod dense;
@@ -56,6 +57,7 @@ pub use activation::{
 };
 pub(crate) use batch_norm::Moments;
 pub use batch_norm::{BatchNorm, BatchNormSpec};
+pub use blur::{Blur, BlurSpec};
 pub use conv2d::{Conv2d, Conv2dSpec, Padding};
 pub use crop::{Crop, CropSpec};
 pub use dense::{Dense, DenseSpec};

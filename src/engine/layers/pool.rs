@@ -8,7 +8,7 @@ use super::kind::{check_sizes, pair};
 use super::{ExportForm, Family, Grads, Layer, LayerKind, Pair, Pass, ReceptiveField};
 use crate::engine::tensor::Shape;
 
-fn pool_shape(input: Shape, window: [usize; 2], stride: [usize; 2]) -> Result<PoolShape, String> {
+pub(super) fn pool_shape(input: Shape, window: [usize; 2], stride: [usize; 2]) -> Result<PoolShape, String> {
     let ([kh, kw], [stride_h, stride_w]) = (window, stride);
     if kh == 0 || kw == 0 || stride_h == 0 || stride_w == 0 {
         return Err("window and stride must be at least 1".into());

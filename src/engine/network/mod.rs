@@ -31,6 +31,6 @@ pub use spec::LayerSpec;
 pub use step_input::StepInput;
 pub use step_profile::StageTime;
 pub use structure::{MAX_PARAMETERS, NamedLayer, Network, group_digits};
-pub use training::TrainingPlan;
+pub use training::{PAIRS_CAPACITY, TrainingPlan};
 
 pub use crate::engine::parameters::{Parameters, Tensor};

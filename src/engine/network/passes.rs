@@ -86,8 +86,13 @@ impl<'a> StepContext<'a> {
         };
         let labels = &self.input.labels[images.start * outputs..images.end * outputs];
         let scale = 1.0 / self.input.labels.len() as f32;
-        shard.loss +=
-            loss.value_and_gradient(predictions, labels, scale, &mut shard.buffers.d_output[..predictions.len()]);
+        let gradient = &mut shard.buffers.d_output[..predictions.len()];
+        shard.loss += loss.value_and_gradient(predictions, labels, scale, gradient);
+        if self.input.pairs.images() > 0 {
+            // The sum over the batch is divided by the number of labels in the end.
+            let of_mean = self.input.pairs.add(images, outputs, predictions, labels, gradient);
+            shard.loss += of_mean * self.input.labels.len() as f64;
+        }
         shard.buffers.in_place = false;
     }
 

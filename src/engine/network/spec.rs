@@ -5,8 +5,9 @@ use std::ops::Deref;
 use serde::{Deserialize, Serialize};
 
 use crate::engine::layers::{
-    AveragePoolSpec, BatchNormSpec, Conv2dSpec, CropSpec, DenseSpec, DropoutSpec, EluSpec, FlattenSpec, LayerKind,
-    LeakyReluSpec, MaxPoolSpec, PReluSpec, ReluSpec, ScaleSpec, SoftsignSpec, SwishSpec, TanhSpec, ZeroPadSpec,
+    AveragePoolSpec, BatchNormSpec, BlurSpec, Conv2dSpec, CropSpec, DenseSpec, DropoutSpec, EluSpec, FlattenSpec,
+    LayerKind, LeakyReluSpec, MaxPoolSpec, PReluSpec, ReluSpec, ScaleSpec, SoftsignSpec, SwishSpec, TanhSpec,
+    ZeroPadSpec,
 };
 
 /// Makes [`LayerSpec`] from lines `"kind in recipes" Variant(Options) "example";`.
@@ -63,6 +64,7 @@ layer_specs! {
     "prelu" PRelu(PReluSpec) "{ kind = 'prelu', slopes = 'per_channel' }";
     "max_pool" MaxPool(MaxPoolSpec) "{ kind = 'max_pool', window = [2, 2] }";
     "average_pool" AveragePool(AveragePoolSpec) "{ kind = 'average_pool', window = [3, 2], stride = [1, 2] }";
+    "blur" Blur(BlurSpec) "{ kind = 'blur', window = [3, 2], stride = [2, 1] }";
     "dropout" Dropout(DropoutSpec) "{ kind = 'dropout', drop_probability = 0.5 }";
     "flatten" Flatten(FlattenSpec) "{ kind = 'flatten' }";
     "dense" Dense(DenseSpec) "{ kind = 'dense', units = 3 }";

@@ -3,6 +3,7 @@
 use ndarray::{ArrayView1, ArrayView4};
 
 use super::Network;
+use crate::engine::loss::PairTerms;
 
 /// The batch of one training step.
 ///
@@ -28,6 +29,7 @@ pub(super) struct StepSlices<'a> {
     pub labels: &'a [f32],
     pub seed: u64,
     pub step: u64,
+    pub pairs: PairTerms,
 }
 
 impl<'a> StepInput<'a> {
@@ -40,7 +42,7 @@ impl<'a> StepInput<'a> {
         let (x, n) = (image_slice(network, self.x), self.x.len_of(ndarray::Axis(0)));
         let labels = self.labels.to_slice().expect("labels must be contiguous");
         assert_eq!(labels.len(), n * network.output().len(), "labels for a batch of {n} images");
-        StepSlices { x, labels, seed: self.seed, step: self.step }
+        StepSlices { x, labels, seed: self.seed, step: self.step, pairs: PairTerms::default() }
     }
 }
 

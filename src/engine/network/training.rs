@@ -21,12 +21,15 @@ use super::step_input::{StepInput, StepSlices};
 use super::step_profile::{StageTime, StepTimes};
 use super::{Network, Parameters};
 use crate::engine::layers::BatchStatistics;
-use crate::engine::loss::Loss;
+use crate::engine::loss::{Loss, PairTerms};
 use crate::engine::parameters::CHUNK;
 use crate::engine::stopwatch::Stopwatch;
 
 /// Upper limit of the shards of a batch: enough to keep 16 threads busy.
 const MAX_SHARDS: usize = 16;
+
+/// Batches with pairs need a plan for a multiple of so many images: each shard then has room for an even number.
+pub const PAIRS_CAPACITY: usize = 2 * MAX_SHARDS;
 
 /// Limits of a group: the images that a shard takes through the layers at a time.
 #[derive(Clone, Copy, Debug)]
@@ -203,7 +206,24 @@ impl TrainingPlan {
     /// code), if `parameters` are not those of such a network, or if the batch is empty, larger than planned, of the wrong shape
     /// or not in standard order.
     pub fn step(&mut self, network: &Network, parameters: &mut Parameters, loss: &Loss, input: StepInput) -> f64 {
-        let (input, used) = self.begin_step(network, parameters, input);
+        self.step_with_pairs(network, parameters, loss, &PairTerms::default(), input)
+    }
+
+    /// As [`step`](TrainingPlan::step), with the terms of the pairs in the batch added to the mean loss.
+    ///
+    /// # Panics
+    ///
+    /// As [`step`](TrainingPlan::step); also if there are pairs and the plan was made for a capacity that is no multiple of
+    /// [`PAIRS_CAPACITY`].
+    pub fn step_with_pairs(
+        &mut self,
+        network: &Network,
+        parameters: &mut Parameters,
+        loss: &Loss,
+        pairs: &PairTerms,
+        input: StepInput,
+    ) -> f64 {
+        let (input, used) = self.begin_step(network, parameters, pairs, input);
         if self.segments.len() == 1 {
             self.step_without_barriers(network, parameters, loss, input, used);
         } else {
@@ -222,7 +242,7 @@ impl TrainingPlan {
     /// As [`step`](TrainingPlan::step).
     pub fn pass_statistics(&mut self, network: &Network, parameters: &mut Parameters, input: StepInput) {
         if self.segments.len() > 1 {
-            let (input, used) = self.begin_step(network, parameters, input);
+            let (input, used) = self.begin_step(network, parameters, &PairTerms::default(), input);
             self.forward_with_barriers(network, parameters, None, input, used);
         }
     }
@@ -232,15 +252,22 @@ impl TrainingPlan {
         &mut self,
         network: &Network,
         parameters: &Parameters,
+        pairs: &PairTerms,
         input: StepInput<'a>,
     ) -> (StepSlices<'a>, usize) {
         assert_eq!(self.fingerprint, network.fingerprint(), "a training plan for another network");
         network.check_parameters(parameters);
-        let input = input.slices(network);
+        let input = StepSlices { pairs: *pairs, ..input.slices(network) };
         let n = input.x.len() / network.input().len();
         assert!(n > 0 && n <= self.capacity, "a batch of {n} images in a plan for 1 to {}", self.capacity);
 
-        let shard_images = n.div_ceil(MAX_SHARDS);
+        assert!(pairs.images() <= n, "{} images in pairs in a batch of {n}", pairs.images());
+        let mut shard_images = n.div_ceil(MAX_SHARDS);
+        if pairs.images() > 0 {
+            // A pair stays in one shard.
+            assert!(self.capacity % PAIRS_CAPACITY == 0, "pairs in a plan for {} images", self.capacity);
+            shard_images = shard_images.next_multiple_of(2);
+        }
         let used = n.div_ceil(shard_images);
         for (index, shard) in self.shards[..used].iter_mut().enumerate() {
             shard.images = index * shard_images..((index + 1) * shard_images).min(n);
@@ -298,7 +325,10 @@ impl TrainingPlan {
             shard.reset();
             shard.buffers = spare_buffers.take();
             shard.scratch = spare_scratch.take();
-            let group = shard.group_capacity(network);
+            let mut group = shard.group_capacity(network);
+            if input.pairs.images() > 0 {
+                group -= group % 2;
+            }
             for images in groups(shard.images.clone(), group) {
                 shard.first = images.start;
                 run.forward(0..stages.len(), shard, images.clone());

@@ -12,17 +12,20 @@ use crate::report::tone::Tone;
 use crate::simulator::trial::trajectory::{
     RUN_DEPTH, Waypoint, find_drives, read_summary, read_trajectory, trajectories,
 };
-use crate::simulator::{DriveSummary, Track};
+use crate::simulator::{Calm, DriveSummary, Track};
 
 /// Headers of [`DriveView::row`].
-pub(super) const HEADERS: [&str; 8] = [
+pub(super) const HEADERS: [&str; 11] = [
     "track",
     "laps without help",
     "autonomy",
     "put back",
     "mean distance from line",
     "95 % below",
-    "wheel trembles by",
+    "wheel trembles by (expert)",
+    "turns back a minute (expert)",
+    "95 % of changes a frame below (expert)",
+    "lateral jerk (expert)",
     "error on the expert's frames",
 ];
 
@@ -79,9 +82,20 @@ impl DriveView {
             times(summary.interventions),
             format!("{:.2} m", summary.cte_mean_m),
             format!("{:.2} m", summary.cte_p95_m),
-            format!("{:.1} °/s", summary.whiteness_deg_s),
+            format!("{:.1} °/s ({:.1})", summary.whiteness_deg_s, summary.expert_whiteness_deg_s),
+            beside(summary, |calm| format!("{:.1}", calm.reversals_per_min), ""),
+            beside(summary, |calm| format!("{:.2}", calm.angle_change_p95_deg), "°"),
+            beside(summary, |calm| format!("{:.1}", calm.lateral_jerk_rms_mps3), " m/s³"),
             self.offline_mae_deg.map_or("-".into(), |mae_deg| format!("{mae_deg:.2}°")),
         ]
+    }
+}
+
+/// A measure of the driver with its unit, and that of the expert; a dash where an older version wrote the drive.
+fn beside(summary: &DriveSummary, measure: impl Fn(&Calm) -> String, unit: &str) -> String {
+    match (&summary.calm, &summary.expert_calm) {
+        (Some(calm), Some(expert)) => format!("{}{unit} ({})", measure(calm), measure(expert)),
+        _ => "-".into(),
     }
 }
 
@@ -117,7 +131,9 @@ pub(super) fn describe(page: &mut Page, drives: &[DriveView]) {
     page.table(&HEADERS, &drives.iter().map(DriveView::row).collect::<Vec<_>>());
     page.paragraph(
         "Laps and distances are those of runs without help, up to the first failure. Autonomy, and the maps, are those of runs \
-         in which the car was put back when it was more than a metre from the line.",
+         in which the car was put back when it was more than a metre from the line. How calm the wheel is: the root mean square of \
+         the rate of the front wheels' angle; how often they turn back by more than 1° in a minute; the change of their angle \
+         from frame to frame that 95 % do not exceed; the root mean square of the rate of the lateral acceleration.",
     );
     page.drawings(&maps(drives.iter().map(|drive| (drive.summary.track.clone(), drive))));
 }

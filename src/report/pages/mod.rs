@@ -1,4 +1,4 @@
-//! Pages that stand alone: of a training run, of a recording, of runs side by side, of what a model looks at.
+//! Pages that stand alone: of a training run, of a recording, of runs side by side, of what a model looks at, of a sweep of latencies.
 
 pub mod comparison;
 mod driven_paths;
@@ -8,3 +8,4 @@ pub mod html;
 pub mod inspection;
 pub mod run;
 mod split_view;
+pub mod sweep;

@@ -7,6 +7,7 @@ use rayon::prelude::*;
 use crate::observer::{Observer, Progress, Tally};
 use crate::simulator::car::speed::Speed;
 use crate::simulator::track::Track;
+use crate::simulator::trial::calm::Calm;
 use crate::simulator::trial::driver::{Driver, Expert};
 use crate::simulator::trial::event::DriveEvent;
 use crate::simulator::trial::outcome::{Failure, INTERVENTION_M, Trial, autonomy_percent, line_errors_m};
@@ -112,10 +113,12 @@ fn put_together(track: &Track, options: &DriveOptions, measured: Vec<Measured>, 
     let sum = |of: fn(&Measured) -> f64| measured.iter().map(of).sum::<f64>();
     let (simulated_s, busy_s) = (sum(|m| m.simulated_s), sum(|m| m.busy_s));
     let (expert_sum, expert_s) = (sum(|m| m.expert.whiteness_sum), sum(|m| m.expert.time_s));
+    let expert_calm = Some(Calm::of(measured.iter().map(|m| &m.expert)));
     let realtime_factor = simulated_s / busy_s.max(1e-9) * threads.min(options.runs) as f64;
     let runs: Vec<TrialPair> = measured.into_iter().map(|m| m.pair).collect();
     let summary = DriveSummary {
         expert_whiteness_deg_s: (expert_sum / expert_s.max(1e-9)).sqrt(),
+        expert_calm,
         realtime_factor,
         ..summarise(track, options, &runs)
     };
@@ -170,11 +173,13 @@ fn summarise(track: &Track, options: &DriveOptions, runs: &[TrialPair]) -> Drive
         mean_speed_mph: free().map(|m| m.speed_mph).sum::<f64>() / free().count().max(1) as f64,
         whiteness_deg_s: (sum(&|r| r.free.whiteness_sum) / time_s).sqrt(),
         expert_whiteness_deg_s: 0.0,
+        calm: Some(Calm::of(runs.iter().map(|r| &r.free))),
+        expert_calm: None,
         realtime_factor: 0.0,
     }
 }
 
-/// Compares two drives with the same seeds: autonomy, completed laps and distance from the line.
+/// Compares two drives with the same seeds: autonomy, completed laps, distance from the line, and how calm they are.
 ///
 /// # Errors
 /// If the drives are of different tracks or seeds.
@@ -195,6 +200,9 @@ pub fn compare(a: &DriveResult, b: &DriveResult) -> Result<Vec<PairedTest>> {
         test("autonomy, %", &|r| r.assisted.autonomy_percent()),
         test("laps completed", &|r| r.free.laps_completed as f64),
         test("distance from the line in assisted runs, m", &mean_cte),
+        test("whiteness, deg/s", &|r| r.free.whiteness_deg_s()),
+        test("wheel reversals a minute", &|r| Calm::of([&r.free]).reversals_per_min),
+        test("lateral jerk, m/s³", &|r| Calm::of([&r.free]).lateral_jerk_rms_mps3),
     ])
 }
 
@@ -219,6 +227,11 @@ mod tests {
         assert!(s.cte_mean_m <= s.cte_rms_m && s.cte_rms_m <= s.cte_p95_m && s.cte_p95_m < 0.3);
         assert!((s.mean_speed_mph - 20.0).abs() < 1.0, "{}", s.mean_speed_mph);
         assert!((s.whiteness_deg_s - s.expert_whiteness_deg_s).abs() < 1e-9);
+        assert_eq!(s.calm, s.expert_calm);
+        let calm = s.calm.unwrap();
+        assert!(calm.reversals_per_min > 0.0 && calm.reversals_per_min < 20.0, "{calm:?}");
+        assert!(calm.angle_change_p95_deg > 0.0 && calm.angle_change_p95_deg < 0.5, "{calm:?}");
+        assert!(calm.lateral_jerk_rms_mps3 > 0.1 && calm.lateral_jerk_rms_mps3 < 5.0, "{calm:?}");
         assert_eq!(zero.summary.laps_completed, 0);
         // NVIDIA (2016) charges 6 s for each intervention.
         let assisted_s: f64 = zero.trials.iter().map(|pair| pair.assisted.time_s).sum();

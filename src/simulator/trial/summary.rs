@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::simulator::car::speed::Speed;
+use crate::simulator::trial::calm::Calm;
 use crate::simulator::trial::outcome::{Trial, TrialOptions};
 
 /// How a driver is put to the test.
@@ -91,6 +92,12 @@ pub struct DriveSummary {
     pub whiteness_deg_s: f64,
     /// The same for the expert with the same seeds.
     pub expert_whiteness_deg_s: f64,
+    /// Further measures of how calm the free trials are. Absent in files of older versions, like the next.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub calm: Option<Calm>,
+    /// The same for the expert with the same seeds.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub expert_calm: Option<Calm>,
     /// Simulated seconds for each second in which a thread drives (the expert's runs left out), times the threads that its
     /// runs can keep at work; the one number that differs between runs.
     pub realtime_factor: f64,

@@ -7,13 +7,15 @@ use crate::geometry::{CarGeometry, Offset, PixelGrid, ViewWarp};
 
 impl Loader {
     /// Writes a sample's network input to `x` and returns its label; `None` if the image cannot be decoded.
-    pub(super) fn make_sample(&self, sample: u32, x: &mut [f32], scratch: &mut Scratch) -> Result<Option<f32>> {
-        let own = sample / self.variants() as u32;
+    pub(super) fn make_sample(&self, wanted: &Wanted, x: &mut [f32], scratch: &mut Scratch) -> Result<Option<f32>> {
+        let own = wanted.sample / self.variants() as u32;
         let (number, camera) = self.images[own as usize];
         let item = self.items[number as usize];
-        let mirrored = self.is_mirrored(sample);
+        let mirrored = self.is_mirrored(wanted.draws);
+        // The second augmentation of a sample has numbers that no first one has.
+        let stream = u64::from(wanted.draws) + if wanted.again { self.samples() as u64 } else { 0 };
         let in_mirrored_world = mirrored && self.spec.samples.mirror == Mirror::Geometry;
-        let view = self.view(sample);
+        let view = self.view(stream);
         let image = view.map_or(own, |offset| self.nearest_image(number, offset));
         let Scratch { file, image: decoded, preprocessor, cached, rgb, planes } = scratch;
         let made = self.cache.get(image as usize, cached, |out| {
@@ -32,7 +34,7 @@ impl Loader {
                 if !self.training || !self.spec.augmentation.is_active() {
                     return 0.0;
                 }
-                let mut rng = rng(self.spec.seed, Purpose::Augment, self.epoch, u64::from(sample));
+                let mut rng = rng(self.spec.seed, Purpose::Augment, self.epoch, stream);
                 self.spec.augmentation.apply(preprocessing, rgb, &mut rng)
             });
         }
@@ -52,10 +54,10 @@ impl Loader {
         Ok(Some(if mirrored { -label } else { label }))
     }
 
-    /// Where beside the driven path a sample is shown from; `None` as it was taken.
-    fn view(&self, sample: u32) -> Option<Offset> {
+    /// Where beside the driven path a sample with the random numbers `stream` is shown from; `None` as it was taken.
+    fn view(&self, stream: u64) -> Option<Offset> {
         let spec = self.spec.augmentation.view.filter(|_| self.training)?;
-        spec.draw(&mut rng(self.spec.seed, Purpose::View, self.epoch, u64::from(sample)))
+        spec.draw(&mut rng(self.spec.seed, Purpose::View, self.epoch, stream))
     }
 
     /// The image of item `number` whose camera was nearest to a car at `offset`.
