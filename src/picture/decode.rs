@@ -186,6 +186,14 @@ impl Passes {
     }
 }
 
+/// Index of the first byte 0xff. Blocks without one are passed by as a whole, which vectorises.
+fn first_0xff(bytes: &[u8]) -> Option<usize> {
+    let (blocks, _) = bytes.as_chunks::<32>();
+    let has_one = |block: &[u8; 32]| block.iter().fold(false, |found, &byte| found | (byte == 0xff));
+    let begin = 32 * blocks.iter().position(has_one).unwrap_or(blocks.len());
+    Some(begin + bytes[begin..].iter().position(|&byte| byte == 0xff)?)
+}
+
 impl Scan {
     fn of(bytes: &[u8]) -> Result<Scan, String> {
         let truncated = || "the JPEG is truncated".to_string();
@@ -226,7 +234,7 @@ impl Scan {
             }
             // Picture data: 0xff is followed by 0 or a restart marker, up to the next segment.
             loop {
-                let place = bytes.get(at..).and_then(|rest| rest.iter().position(|&byte| byte == 0xff));
+                let place = bytes.get(at..).and_then(first_0xff);
                 let Some(marker) = place else { return Ok(found(bytes.len(), false, &passes)) };
                 at += marker;
                 match bytes.get(at + 1) {

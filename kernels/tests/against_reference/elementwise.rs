@@ -229,11 +229,15 @@ fn updates_agree_with_the_loops() {
             let (grads, v) = (numbers(2, len), numbers(4, len).iter().map(|v| v.abs()).collect::<Vec<_>>());
             let mut expected = [numbers(1, len), numbers(3, len), v];
             let mut actual = expected.clone();
-            let [p, m, v] = &mut expected;
-            reference::adam(&step, p, &grads, m, v);
-            let [p, m, v] = &mut actual;
-            update::adam(isa, &step, p, &grads, m, v);
-            failures.compare(&format!("adam {what}"), &actual.concat(), &expected.concat(), 1e-6);
+            // A large epsilon tells whether it stands outside the root.
+            for epsilon in [1e-7, 0.3] {
+                let step = AdamStep { epsilon, ..step };
+                let [p, m, v] = &mut expected;
+                reference::adam(&step, p, &grads, m, v);
+                let [p, m, v] = &mut actual;
+                update::adam(isa, &step, p, &grads, m, v);
+                failures.compare(&format!("adam {what}, {epsilon}"), &actual.concat(), &expected.concat(), 2e-6);
+            }
 
             let mut expected = [numbers(1, len), numbers(3, len)];
             let mut actual = expected.clone();

@@ -93,6 +93,34 @@ fn norm_rectify_agrees_with_its_parts() {
 }
 
 #[test]
+fn of_equal_values_in_a_window_the_index_is_that_of_the_first() {
+    let mut failures = Failures::default();
+    let [c, h, w, n] = [2, 9, 150, 2];
+    for kh in [1, 2, 3] {
+        let shape = pool::PoolShape { c, h, w, kh, kw: 4, stride_h: kh, stride_w: 4 };
+        let (out_h, out_w) = (shape.out_h(), shape.out_w());
+        // So coarse that most windows have two largest values or more.
+        let x: Vec<f32> = numbers(1, n * c * h * w).iter().map(|v| v.round()).collect();
+        let mut expected = Vec::new();
+        for plane in x.chunks_exact(h * w) {
+            for at in 0..out_h * out_w {
+                let (top, left) = (at / out_w * kh, at % out_w * 4);
+                let places = (0..4 * kh).map(|k| (top + k / 4) * w + left + k % 4);
+                let max = places.clone().map(|place| plane[place]).fold(f32::NEG_INFINITY, f32::max);
+                expected.push(places.clone().find(|place| plane[*place] == max).unwrap() as f32);
+            }
+        }
+        for isa in isas() {
+            let (mut y, mut argmax) = (nans(expected.len()), vec![0; expected.len()]);
+            pool::max_forward_with_argmax(isa, &shape, n, w, &x, &mut y, &mut argmax);
+            let argmax: Vec<f32> = argmax.iter().map(|&at| at as f32).collect();
+            failures.compare(&format!("{} {kh}", isa.name()), &argmax, &expected, 0.0);
+        }
+    }
+    failures.report();
+}
+
+#[test]
 fn of_equal_values_in_a_window_the_first_gets_the_gradient() {
     let mut failures = Failures::default();
     let [c, h, w, n] = [2, 6, 70, 2];
