@@ -140,6 +140,7 @@ impl LayerKind for BlurSpec {
 
 #[cfg(test)]
 mod tests {
+    use super::super::check_kind;
     use super::super::gradcheck::check_layer;
     use super::*;
 
@@ -154,6 +155,13 @@ mod tests {
             ] {
                 check_layer(&Blur::new(Shape::new(c, h, w), window, stride, isa).unwrap(), n);
             }
+        }
+    }
+
+    #[test]
+    fn it_answers_truly_for_any_window_and_stride() {
+        for (window, stride) in [([3, 2], [2, 1]), ([5, 5], [1, 2]), ([1, 1], [1, 1])] {
+            check_kind(&BlurSpec { window, stride }, Shape::new(2, 7, 6));
         }
     }
 
