@@ -1,6 +1,10 @@
-//! From a file's bytes to network input, one image on one thread, for each shipped recipe.
+//! From a file's bytes to network input, one image on one thread, for each shipped recipe; and the view from beside the path of
+//! 80x320 pixels.
+
+use std::hint::black_box;
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
+use steersman::geometry::{CarGeometry, Offset, PixelGrid, ViewWarp};
 use steersman::picture::{RgbImage, decode::decode_rgb};
 use steersman::recipe::{Recipe, SHIPPED};
 
@@ -25,6 +29,15 @@ fn loader(c: &mut Criterion) {
             });
         });
     }
+    let car = CarGeometry::preset("udacity").expect("a preset");
+    let grid = PixelGrid::part(&car, [56.0 / 160.0, 136.0 / 160.0], [80, 320]);
+    let (from, mut to) = (vec![100; 80 * 320 * 3], vec![0; 80 * 320 * 3]);
+    group.bench_function("view from beside the path", |b| {
+        b.iter(|| {
+            let offset = Offset { right_m: black_box(0.4), ahead_m: 0.0, turn: black_box(0.05) };
+            ViewWarp::new(&car, grid, 0.0, offset).apply(&from, &mut to);
+        });
+    });
     group.finish();
 }
 

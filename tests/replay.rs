@@ -132,6 +132,20 @@ fn the_command_tells_writes_and_refuses() {
     std::fs::write(&beside, "[camera]\npreset = \"udacity\"\nside_offsets_m = [0.8, -0.8]\n").unwrap();
     let (wrong, _) = told("1", "wrong");
     assert!(ratio(&wrong) > 1.3 * ratio(&report), "side cameras that have changed places: {wrong}");
+
+    // The fit finds the mount again, and what it prints can stand beside the log.
+    std::fs::write(&beside, "[camera]\npreset = \"steersman\"\nheight_m = 1.4\npitch_deg = 7.5\nroll_deg = 0.0\n")
+        .unwrap();
+    let table = String::from_utf8(run(dir, &["inspect", "drive", "--fit-camera"]).stdout).unwrap();
+    let fitted: toml::Table = table.parse().unwrap();
+    let found = |key: &str| fitted["camera"][key].as_float().unwrap();
+    assert!((found("pitch_deg") - 9.5).abs() < 0.5 && (found("roll_deg") - 1.2).abs() < 0.3, "{table}");
+    assert!((found("height_m") - 1.2).abs() < 0.1, "{table}");
+    std::fs::write(&beside, &table).unwrap();
+    let (again, _) = told("1", "again");
+    assert!(ratio(&again) < 1.05 * ratio(&report), "{again}");
+    assert!(said(&["inspect", "drive", "drive", "--fit-camera"]).contains("one recording"));
+
     std::fs::write(&beside, "[camera]\nheight_m = 0.0\n").unwrap();
     let told_off = said(&["drive", "zero", "--on", "drive"]);
     assert!(told_off.contains("steersman.toml") && told_off.contains("height_m: must be 0.01 to 100 m"), "{told_off}");

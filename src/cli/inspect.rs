@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 use serde::Serialize;
 
+use super::fit_camera;
 use super::recording_args::RecordingArgs;
 use super::share_bar::ShareBar;
 use super::{RecipeArgs, end_with, new_folder, pool, print, print_json, refuse_existing, stop_on_ctrl_c};
@@ -26,6 +27,9 @@ pub struct InspectArgs {
     reading: RecordingArgs,
     #[command(flatten)]
     recipe: RecipeArgs,
+    /// Print a [camera] table for steersman.toml instead: the mount that predicts the side cameras' pictures best
+    #[arg(long, conflicts_with_all = ["out", "json"])]
+    fit_camera: bool,
     /// Seed of the split that the page shows
     #[arg(long, default_value_t = 1)]
     seed: u64,
@@ -49,6 +53,9 @@ pub fn run(args: InspectArgs) -> Result<()> {
     let recipe = args.recipe.find_or("recording")?;
     args.out.as_deref().map_or(Ok(()), refuse_existing)?;
     let (pool, stop) = (pool(args.threads)?, stop_on_ctrl_c()?);
+    if args.fit_camera {
+        return pool.install(|| fit_camera::run(&args.recordings, &args.reading));
+    }
     let said = args.reading.said();
     let treatment = Treatment { samples: recipe.samples.clone(), balance: recipe.balance.clone() };
     let (mut inspections, mut reports, mut failed) = (Vec::new(), Vec::new(), Vec::new());

@@ -23,6 +23,7 @@ mod evaluate;
 mod experiment;
 mod explain;
 mod export;
+mod fit_camera;
 mod import;
 mod inspect;
 mod model_arg;

@@ -85,7 +85,7 @@ pub struct Recording {
     pub image_size: Option<[usize; 2]>,
     /// Camera and car: as was said, or the preset for recordings of this kind.
     pub geometry: CarGeometry,
-    /// Whether a preset was named.
+    /// Whether all of it was said.
     pub camera_named: bool,
     /// Whether `time_ms` comes from the recording or the user; otherwise a rate is assumed.
     pub times_plausible: bool,

@@ -287,7 +287,7 @@ impl Collected {
             notices,
             image_size: None,
             geometry,
-            camera_named: camera.preset.is_some(),
+            camera_named: camera.is_complete(),
             times_plausible: true,
             unit_trouble: self.unit_trouble,
             picture_hashes: Vec::new(),

@@ -163,6 +163,23 @@ pub struct GeometryEntry {
 }
 
 impl GeometryEntry {
+    /// Whether nothing need be assumed: a preset is named, or every entry is there.
+    pub fn is_complete(&self) -> bool {
+        let said = [
+            self.image.is_some(),
+            self.focal_px.is_some(),
+            self.height_m.is_some(),
+            self.ahead_m.is_some(),
+            self.pitch_deg.is_some(),
+            self.yaw_deg.is_some(),
+            self.roll_deg.is_some(),
+            self.side_offsets_m.is_some(),
+            self.wheelbase_m.is_some(),
+            self.full_lock_deg.is_some(),
+        ];
+        self.preset.is_some() || said.iter().all(|said| *said)
+    }
+
     /// The geometry: the preset of this entry, or else `usual`, with the entries that differ.
     ///
     /// # Errors

@@ -8,10 +8,12 @@
 //! What this cannot show: other traffic, what is hidden in the recorded view, and ground that is not flat. [`side_camera_check`]
 //! measures on the recording's own side cameras how far the warp can be trusted.
 
+mod fit;
 mod log;
 mod run;
 mod trust;
 
+pub use fit::{CameraFit, fit_camera};
 pub use log::{Frames, ReplayLog};
 pub use run::{
     MAX_OFFSET_M, MAX_TURN_DEG, ReplayFrame, ReplayMoment, ReplayOptions, ReplayRun, ReplaySummary, moments_csv,

@@ -10,6 +10,8 @@ use crate::geometry::{Offset, PixelGrid, ViewWarp};
 
 /// Rows that are looked at, spread over the recording.
 const ROWS: usize = 200;
+/// Below this share of the picture's height lies the bonnet, which moves with the camera.
+pub(super) const MAX_ROW_SHARE: f64 = 135.0 / 160.0;
 
 /// How well the side cameras' pictures are predicted from the centre camera's.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -40,14 +42,10 @@ impl WarpCheck {
 ///
 /// Pictures that cannot be read.
 pub fn side_camera_check(log: &ReplayLog) -> Result<Option<WarpCheck>> {
-    let rows: Vec<usize> = (log.sessions.iter().flat_map(|session| session.rows.clone()))
-        .filter(|&row| View::ALL.iter().all(|&camera| log.recording.row_has(row, camera)))
-        .collect();
-    if rows.is_empty() || log.geometry.side_offsets_m == [0.0, 0.0] {
+    let looked_at = rows_with_all_cameras(log, ROWS);
+    if looked_at.is_empty() {
         return Ok(None);
     }
-    let step = rows.len().div_ceil(ROWS);
-    let looked_at: Vec<usize> = rows.into_iter().step_by(step).collect();
     let found: Vec<[f64; 2]> = looked_at
         .par_iter()
         .map_init(Frames::default, |frames, &row| errors(log, frames, row))
@@ -62,6 +60,16 @@ pub fn side_camera_check(log: &ReplayLog) -> Result<Option<WarpCheck>> {
         doubtful: doubtful.len(),
         doubtful_rows: doubtful.into_iter().take(20).collect(),
     }))
+}
+
+/// Up to `count` rows with the pictures of three cameras at different places, spread over the recording.
+pub(super) fn rows_with_all_cameras(log: &ReplayLog, count: usize) -> Vec<usize> {
+    let rows: Vec<usize> = (log.sessions.iter().flat_map(|session| session.rows.clone()))
+        .filter(|&row| View::ALL.iter().all(|&camera| log.recording.row_has(row, camera)))
+        .filter(|_| log.geometry.side_offsets_m != [0.0, 0.0])
+        .collect();
+    let step = rows.len().div_ceil(count).max(1);
+    rows.into_iter().step_by(step).collect()
 }
 
 /// Mean difference in grey levels of both side pictures from the warped and from the unwarped centre picture.
@@ -79,8 +87,9 @@ fn errors(log: &ReplayLog, frames: &mut Frames, row: usize) -> Result<[f64; 2]> 
         }
         for y in 0..centre.height {
             for x in 0..centre.width {
-                // The ground that both show, without the bonnet, which moves with the camera: it lies below the lens' reach.
-                if !warp.sees_ground(x as f64 + 0.5, y as f64 + 0.5) || y * 160 >= centre.height * 136 {
+                // The ground that both show, without the bonnet.
+                let bonnet = y as f64 > MAX_ROW_SHARE * centre.height as f64;
+                if bonnet || !warp.sees_ground(x as f64 + 0.5, y as f64 + 0.5) {
                     continue;
                 }
                 let at = (y * centre.width + x) * 3;

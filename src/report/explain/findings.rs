@@ -158,7 +158,9 @@ fn about_light(darker_deg: f64, brighter_deg: f64, recipe: &Recipe) -> String {
 
 fn about_shifts(recipe: &Recipe) -> String {
     let problem = "It does not steer back when the road lies to one side: it has not learned to recover";
-    let (cameras, shifts) = (recipe.samples.side_cameras.is_some(), recipe.augmentation.shift_px > 0.0);
+    let augmentation = &recipe.augmentation;
+    let shifts = augmentation.shift_px > 0.0 || augmentation.view.is_some();
+    let cameras = recipe.samples.side_cameras.is_some();
     let side_cameras = "--set samples.side_cameras=0.2, if the recordings have side cameras";
     let shift = "--set augmentation.shift_px=40 --set augmentation.shift_steering_per_px=0.003";
     match (cameras, shifts) {
@@ -180,7 +182,9 @@ fn about_mirror(recipe: &Recipe) -> String {
     let askew = "a camera that is mounted askew (Udacity's is rolled by 1.2°) does the same, for mirrored pictures then show the \
                  car beside its place";
     match recipe.samples.flip {
-        Flip::None => format!("{problem}. Train with --set samples.flip=random; {askew}."),
+        Flip::None => format!(
+            "{problem}. Train with --set samples.flip=random; {askew}. --set samples.mirror=geometry helps then."
+        ),
         Flip::Both | Flip::Random => {
             format!("{problem}, although the recipe mirrors its pictures. It may need more epochs; {askew}.")
         }

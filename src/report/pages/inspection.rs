@@ -9,6 +9,7 @@ use crate::recipe::Recipe;
 use crate::report::charts::chart::{Axis, Chart, Mark};
 use crate::report::charts::palette;
 use crate::report::charts::steering::{driven_times, histogram};
+use crate::report::pages::driven_paths::driven_paths;
 use crate::report::pages::html::{Figure, Page};
 use crate::report::pages::split_view::SplitView;
 use crate::report::tone::Tone;
@@ -40,6 +41,7 @@ pub fn page(inspections: Vec<Inspection>, recipe: &Recipe, seed: u64) -> String 
         }
         overview(&mut page, inspection);
         labels(&mut page, inspection);
+        driven_paths(&mut page, &inspection.recording);
         if !inspection.frames.is_empty() && !inspection.recording.rows.is_empty() {
             samples(&mut page, &inspection.recording, recipe, share(SAMPLES));
             colours(&mut page, &inspection.recording, &recipe.preprocessing, share(COLOURED));

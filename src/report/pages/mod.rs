@@ -1,6 +1,7 @@
 //! Pages that stand alone: of a training run, of a recording, of runs side by side, of what a model looks at, of a sweep of latencies.
 
 pub mod comparison;
+mod driven_paths;
 mod drives;
 pub mod explanation;
 pub mod html;
