@@ -167,7 +167,7 @@ impl PairTerms {
             if from >= to {
                 continue;
             }
-            assert!(from % 2 == 0 && to % 2 == 0, "a pair of images {from} to {to} is cut");
+            assert!(from.is_multiple_of(2) && to.is_multiple_of(2), "a pair of images {from} to {to} is cut");
             let scale = weight / (count * outputs) as f64;
             for pair in (from..to).step_by(2) {
                 let (a, b) = ((pair - images.start) * outputs, (pair + 1 - images.start) * outputs);

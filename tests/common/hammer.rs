@@ -10,7 +10,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 /// A read that takes longer hangs, seconds.
-const HANG_S: u64 = 30;
+const HANG_S: u64 = 120;
 
 /// A number in an environment variable.
 pub fn number<T: std::str::FromStr>(variable: &str, default: T) -> T {

@@ -265,7 +265,7 @@ impl TrainingPlan {
         let mut shard_images = n.div_ceil(MAX_SHARDS);
         if pairs.images() > 0 {
             // A pair stays in one shard.
-            assert!(self.capacity % PAIRS_CAPACITY == 0, "pairs in a plan for {} images", self.capacity);
+            assert!(self.capacity.is_multiple_of(PAIRS_CAPACITY), "pairs in a plan for {} images", self.capacity);
             shard_images = shard_images.next_multiple_of(2);
         }
         let used = n.div_ceil(shard_images);
