@@ -60,6 +60,9 @@ pub struct Recipe {
     /// Which epoch's weights become the model.
     #[serde(default)]
     pub keep: Keep,
+    /// The error on the validation side that says which epoch is best, and when to stop early.
+    #[serde(default, skip_serializing_if = "KeepBy::is_loss")]
+    pub keep_by: KeepBy,
     /// The average of the weights over updates that is evaluated and becomes the model; the weights themselves when absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub averaging: Option<AveragingSpec>,
@@ -110,6 +113,24 @@ pub enum Keep {
     /// The last one. Where the learning rate falls to nothing the last epoch is the end of the descent, and differences
     /// between the validation losses of the last few are chance.
     Last,
+}
+
+/// The error on the validation side by which epochs are compared.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum KeepBy {
+    /// The squared error against the labels, over all images.
+    #[default]
+    Loss,
+    /// The squared error of the centre camera's images against the steering that follows the driven path: it does not depend on
+    /// how the driver moved the wheel.
+    Path,
+}
+
+impl KeepBy {
+    fn is_loss(&self) -> bool {
+        *self == KeepBy::Loss
+    }
 }
 
 fn default_full_lock_deg() -> f64 {

@@ -25,6 +25,8 @@ fn learn(folder: &Path, threads: usize) -> (TrainResult, TrackResult) {
     pool.install(|| {
         let request = TrainRequest {
             recordings: recordings(&folder.join("recordings"), &takes, &mut Unobserved).unwrap().0,
+            validate: Vec::new(),
+            also: Vec::new(),
             said: Description::default(),
             recipe: Recipe::find("lenet", &overrides).unwrap(),
             out: folder.join(format!("run-{threads}")),

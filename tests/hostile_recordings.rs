@@ -366,6 +366,8 @@ fn damaged_runs_go_on_or_are_refused() {
     let layers = "layers=[{kind='scale', factor=0.004, offset=-0.5}, {kind='flatten'}, {kind='dense', units=1}]";
     let settings = [layers, "preprocessing.resize=[8, 8]", "batch=8", "epochs=3", "split.validation_share=0"];
     let request = TrainRequest {
+        validate: Vec::new(),
+        also: Vec::new(),
         recordings: vec![log],
         said: Description::default(),
         recipe: Recipe::find("lenet", &settings.map(String::from)).unwrap(),

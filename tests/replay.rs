@@ -6,6 +6,8 @@ use std::path::Path;
 use std::sync::Mutex;
 
 use common::command::{error, json, run};
+use common::mp4;
+use common::page::{Page, serve};
 use steersman::dataset::{self, DrivenSessions};
 use steersman::geometry::{CarGeometry, LookAhead};
 use steersman::picture::RgbImage;
@@ -113,13 +115,29 @@ fn the_command_tells_writes_and_refuses() {
     let told = |threads: &str, out: &str| {
         let mut report = json(dir, &["drive", "zero", "--on", "drive", "--threads", threads, "--out", out, "--json"]);
         report.as_object_mut().unwrap().remove("frames_per_second");
-        (report, std::fs::read_to_string(dir.join(out).join("session_1.csv")).unwrap())
+        (report, std::fs::read_to_string(dir.join(out).join("assisted_1.csv")).unwrap())
     };
     let (report, csv) = told("1", "one");
     assert_eq!((&report, &csv), (&told("2", "two").0, &csv));
     assert!(report["interventions"].as_u64() > Some(2) && report["warp"]["rows"].as_u64() > Some(50), "{report}");
     assert_eq!(csv.lines().count() as u64, 1 + report["frames"].as_u64().unwrap());
-    assert!(dir.join("one/summary.json").is_file());
+    // The folder is laid out as that of a drive on a track.
+    let read = |name: &str| std::fs::read_to_string(dir.join("one").join(name)).unwrap();
+    let summary: serde_json::Value = serde_json::from_str(&read("summary.json")).unwrap();
+    assert_eq!(
+        (&summary["track"], &summary["laps_completed"], &summary["runs"]),
+        (&"drive (recording)".into(), &0.into(), &1.into())
+    );
+    for (of_track, own) in
+        [("autonomy_percent", "autonomy_percent"), ("cte_p95_m", "offset_p95_m"), ("distance_m", "distance_m")]
+    {
+        assert_eq!(summary[of_track], report[own], "{of_track}");
+    }
+    let put_back = csv.lines().skip(1).filter(|line| line.split(',').nth(8) == Some("1")).count();
+    assert_eq!(put_back as u64, report["interventions"].as_u64().unwrap());
+    assert!(csv.starts_with("time_s,x_m,y_m,s_m,cte_m,steering,throttle,speed_mph,intervention,heading_deg,"));
+    let map = read("map.svg");
+    assert!(roxmltree::Document::parse(&map).is_ok() && map.contains("session 1 of 1, put back: "));
 
     let said = |args: &[&str]| error(dir, args);
     assert!(said(&["drive", "expert", "--on", "drive"]).contains("name a model"));
@@ -153,4 +171,31 @@ fn the_command_tells_writes_and_refuses() {
     let told = run(dir, &["drive", "zero", "--on", "drive"]).stderr;
     assert!(String::from_utf8(told).unwrap().contains("`udacity` is assumed"));
     assert!(said(&["drive", "zero", "--on", "drive", "--latency-ms=-1"]).contains("latency"));
+}
+
+#[test]
+fn a_drive_on_a_recording_is_filmed_and_watched() {
+    let scratch = tempfile::tempdir().unwrap();
+    let dir = scratch.path();
+    run(dir, &["record", "--track", "lake", "--laps", "0.1", "--out", "drive"]);
+    let filmed = json(dir, &["drive", "zero", "--on", "drive", "--video", "drive.mp4", "--json"]);
+    let video = mp4::read(&dir.join("drive.mp4"));
+    let driven_s = filmed["time_s"].as_f64().unwrap();
+    // The last picture stays for two seconds.
+    assert!((video.seconds[0] - driven_s - 2.0).abs() < 0.2, "{} s of {driven_s}", video.seconds[0]);
+    assert!(error(dir, &["drive", "zero", "--on", "drive", "--video", "drive.mp4"]).contains("exists already"));
+    let no_saliency = ["drive", "zero", "--on", "drive", "--video", "other.mp4", "--saliency"];
+    assert!(error(dir, &no_saliency).contains("has no saliency"));
+
+    let served = serve(dir, &["drive", "zero", "--on", "drive", "--watch"]);
+    let mut page = Page::open(served.port);
+    assert_eq!((&page.hello["mode"], page.hello["edges"].as_array().unwrap().len()), (&"watch".into(), 1));
+    let first = page.next().unwrap();
+    let mut last = page.next().unwrap();
+    assert!(first.camera.starts_with(&[0xff, 0xd8]) && first.state["title"] == "zero, session 1 of 1");
+    while let Ok(frame) = page.next() {
+        last = frame;
+    }
+    assert!(last.number("time_s") > first.number("time_s") && last.number("laps") <= 1.0);
+    assert!(last.number("x").hypot(last.number("y")) > 20.0, "the car has made way: {}", last.state);
 }

@@ -128,6 +128,8 @@ fn watched(log: &Path, out: &Path, at_batch: &dyn Fn()) -> (steersman::Result<Tr
     let settings = [LINEAR, "preprocessing.resize=[16, 16]", "batch=8", "epochs=2"].map(String::from);
     let request = TrainRequest {
         recordings: vec![log.to_path_buf()],
+        validate: Vec::new(),
+        also: Vec::new(),
         said: Description::default(),
         recipe: Recipe::find("lenet", &settings).unwrap(),
         out: out.to_path_buf(),

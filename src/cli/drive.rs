@@ -39,7 +39,7 @@ pub struct DriveArgs {
     #[arg(long, required_unless_present = "on")]
     track: Option<String>,
     /// Drive on the pictures of a recording instead of a track: the nearest one, warped to where the car is
-    #[arg(long, value_name = "RECORDING", conflicts_with_all = ["track", "watch", "video"])]
+    #[arg(long, value_name = "RECORDING", conflicts_with = "track")]
     on: Option<PathBuf>,
     /// With --on: camera and car of the recording: udacity, udacity-straight, steersman or donkeycar [default: by its format]
     #[arg(long, value_name = "PRESET", requires = "on")]
@@ -130,6 +130,10 @@ pub fn run(args: DriveArgs) -> Result<()> {
                 reading: &args.reading,
                 against: args.against.as_deref(),
                 out: args.out.as_deref(),
+                watch: args.watch.then_some(args.port),
+                video: args.video.as_deref(),
+                saliency: args.saliency,
+                fps: args.fps,
                 camera: args.camera.as_deref(),
                 latency_ms,
                 threads: args.threads,

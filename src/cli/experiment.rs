@@ -1,9 +1,11 @@
-//! `steersman experiment`: the two experiments of the write-ups and what makes the wheel calm, each to the end of the road.
+//! `steersman experiment`: the two experiments of the write-ups and what makes the wheel calm, each to the end of the road; and one of
+//! the replay.
 
 use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
 
+use super::experiment_replay::{self, ReplayExperimentArgs};
 use super::progress::JobDisplay;
 use super::recording_args::RecordingArgs;
 use super::{RecipeArgs, or_dash, pool, print_json, refuse_existing, stop_on_ctrl_c};
@@ -15,7 +17,7 @@ use crate::main_job::training_set::RANDOM_TRACKS;
 use crate::observer::Observer;
 use crate::simulator::Track;
 
-/// Compare splits, colour spaces or what makes the wheel calm: what the validation loss promises beside what the drive delivers
+/// Compare splits, colour spaces, what makes the wheel calm, or models: what a number promises beside what the drive delivers
 #[derive(Debug, Args)]
 pub struct ExperimentArgs {
     /// What is varied
@@ -66,6 +68,8 @@ enum SubjectArg {
     Split,
     /// RGB, YUV, HSV, the saturation alone, grey
     Colour,
+    /// Models of all qualities: does driving on a recording tell how they drive in the simulator?
+    Replay,
     /// Averaged weights, terms of smoothness, blur before strides: what makes the wheel calm
     Smooth,
 }
@@ -73,6 +77,16 @@ enum SubjectArg {
 pub fn run(args: ExperimentArgs) -> Result<()> {
     if args.runs == 0 {
         return Err(Error::Usage("--runs 0: at least 1 run is needed".into()));
+    }
+    if let SubjectArg::Replay = args.subject {
+        if !args.recordings.is_empty() {
+            return Err(Error::Usage("experiment replay makes recordings of its own; leave out --recording".into()));
+        }
+        args.tracks.iter().try_for_each(|track| Track::load(track).map(drop))?;
+        let ExperimentArgs { tracks, quick, threads, json, cache: cache_mib, .. } = args;
+        let runs = if quick { 1 } else { args.runs };
+        let replay = ReplayExperimentArgs { tracks, runs, quick, cache_mib, threads, json };
+        return experiment_replay::run(replay, &new_csv(args.out, args.subject)?);
     }
     let given = args.reading.expand(args.recordings)?;
     let held_out = held_out::check(&given, args.force_held_out)?;
@@ -107,6 +121,7 @@ pub fn run(args: ExperimentArgs) -> Result<()> {
     let subject = match args.subject {
         SubjectArg::Split => Subject::Split,
         SubjectArg::Colour => Subject::Colour,
+        SubjectArg::Replay => unreachable!("it has ended above"),
         SubjectArg::Smooth => Subject::Smooth,
     };
     let plan = ExperimentPlan {
@@ -154,6 +169,7 @@ fn new_csv(out: Option<PathBuf>, subject: SubjectArg) -> Result<PathBuf> {
     let name = match subject {
         SubjectArg::Split => "split",
         SubjectArg::Colour => "colour",
+        SubjectArg::Replay => "replay",
         SubjectArg::Smooth => "smooth",
     };
     let of_number = |n: u32| PathBuf::from(format!("runs/experiment-{name}-{n}.csv"));

@@ -21,6 +21,7 @@ mod drive;
 mod drive_sweep;
 mod evaluate;
 mod experiment;
+mod experiment_replay;
 mod explain;
 mod export;
 mod fit_camera;
@@ -39,6 +40,7 @@ mod summary;
 mod terminal;
 mod tracks;
 mod train;
+mod verdict;
 mod video;
 mod words;
 

@@ -1,6 +1,8 @@
 //! `steersman drive --on RECORDING`: closed-loop driving on recorded pictures.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
 use serde::Serialize;
@@ -8,16 +10,21 @@ use serde::Serialize;
 use super::model_arg::model_file;
 use super::recording_args::RecordingArgs;
 use super::share_bar::ShareBar;
-use super::{load_pilot, pool, print, print_json, stop_on_ctrl_c};
+use super::video::tell_video;
+use super::{load_pilot, pool, print, print_json, refuse_existing, stop_on_ctrl_c};
 use crate::error::{Error, Result};
-use crate::files::atomic_file;
 use crate::files::new_folder::NewFolder;
 use crate::geometry::GeometryEntry;
+use crate::live::{Hello, Live, WatchRecording};
 use crate::observer::{StopSignal, Tally};
 use crate::picture::RgbImage;
+use crate::pilot::Pilot;
 use crate::replay::{
-    ReplayLog, ReplayOptions, ReplayRun, ReplaySummary, WarpCheck, moments_csv, replay, side_camera_check, summarise,
+    ReplayFrame, ReplayLog, ReplayOptions, ReplayRun, ReplaySummary, WarpCheck, replay, side_camera_check, summarise,
 };
+use crate::report;
+use crate::report::video::on_recording::ReplayVideo;
+use crate::report::video::onlooker::Onlooker;
 
 /// What `drive` was asked for, as far as it concerns recordings.
 pub struct ReplayArgs<'a> {
@@ -29,8 +36,16 @@ pub struct ReplayArgs<'a> {
     pub reading: &'a RecordingArgs,
     /// A second model.
     pub against: Option<&'a str>,
-    /// Folder for the trajectories.
+    /// Folder for the trajectories and maps.
     pub out: Option<&'a Path>,
+    /// Port of the page that shows the drive.
+    pub watch: Option<u16>,
+    /// Video of the first session.
+    pub video: Option<&'a Path>,
+    /// Colour in it what excites the model.
+    pub saliency: bool,
+    /// Pictures a second of it.
+    pub fps: Option<f64>,
     /// Name of a camera preset.
     pub camera: Option<&'a str>,
     /// Time from a picture to the wheels, ms.
@@ -75,26 +90,55 @@ pub fn run(args: &ReplayArgs) -> Result<()> {
     };
     let log = ReplayLog::new(&recording, geometry)?;
     let options = ReplayOptions { latency_ms: args.latency_ms, ..ReplayOptions::usual(&log.geometry) };
+    let at_wheel = Wheel::find(args.model)?;
+    let other = args.against.map(|name| Wheel::find(name).map(|wheel| (name, wheel))).transpose()?;
+    if let Some(video) = args.video {
+        refuse_existing(video)?;
+    }
     let folder = args.out.map(NewFolder::create).transpose()?;
+    let hello = || Hello::on_recording(format!("at the wheel: {}", args.model), &log);
+    let live = args.watch.map(|port| Live::start(port, hello(), false)).transpose()?;
     let stop = stop_on_ctrl_c()?;
-    let go = |name: &str| -> Result<(Vec<ReplayRun>, ReplaySummary)> {
+    if let Some(live) = &live {
+        eprintln!("open {} to watch", live.url());
+    }
+    let drive = Drive { log: &log, options: &options, stop: &stop };
+    let timed = |drive: &dyn Fn() -> Result<Vec<ReplayRun>>| -> Result<(Vec<ReplayRun>, ReplaySummary)> {
         let began = Instant::now();
-        let runs = pool.install(|| drive_on(&log, &options, name, &stop))?;
+        let runs = drive()?;
         let summary = summarise(&runs, began.elapsed().as_secs_f64());
         Ok((runs, summary))
     };
-    let (runs, summary) = go(args.model)?;
-    let against = args.against.map(go).transpose()?.map(|(_, summary)| summary);
+    let (runs, summary) = pool.install(|| {
+        timed(&|| match &live {
+            Some(live) => drive.watched(&at_wheel, args.model, live),
+            None => drive.go(&at_wheel, args.model),
+        })
+    })?;
+    if let Some(live) = live {
+        let ReplaySummary { autonomy_percent, interventions, offset_mean_m, .. } = summary;
+        live.finish(&format!(
+            "The drive of {} is over: autonomy {autonomy_percent:.1} %, put back {interventions} times, on average \
+             {offset_mean_m:.2} m from the path.",
+            args.model
+        ));
+    }
+    let other = other.map(|(name, wheel)| Ok((name, pool.install(|| timed(&|| drive.go(&wheel, name)))?.1)));
+    let other: Option<(&str, ReplaySummary)> = other.transpose()?;
     let warp = pool.install(|| side_camera_check(&log))?;
     if let Some(folder) = folder {
-        write_runs(&runs, &summary, folder)?;
+        report::on_recording::write(&log, &runs, &summary, folder)?;
+    }
+    if let (Some(path), Some(run)) = (args.video, runs.first()) {
+        pool.install(|| drive.film(&at_wheel, args, run, path))?;
     }
     if args.json {
-        let (assumed_speed_mps, warp, against) = (log.assumed_speed_mps, warp.as_ref(), against.as_ref());
+        let (assumed_speed_mps, warp, against) =
+            (log.assumed_speed_mps, warp.as_ref(), other.as_ref().map(|(_, summary)| summary));
         return print_json(&Report { recording: args.on, summary: &summary, assumed_speed_mps, warp, against });
     }
     let mut text = summary_text(args.model, &summary);
-    if let (Some(name), Some(summary)) = (args.against, &against) {
+    if let Some((name, summary)) = &other {
         text += &format!("\n{}", summary_text(name, summary));
     }
     if let Some(mps) = log.assumed_speed_mps {
@@ -104,52 +148,97 @@ pub fn run(args: &ReplayArgs) -> Result<()> {
     print(&text)
 }
 
-/// Drives along all sessions with the model of file `name`, or with `zero`.
-fn drive_on(log: &ReplayLog, options: &ReplayOptions, name: &str, stop: &StopSignal) -> Result<Vec<ReplayRun>> {
-    let pilot = match name {
-        "zero" => None,
-        "expert" => {
-            return Err(Error::Usage(
+/// Who steers: a model, or nobody.
+struct Wheel(Option<Pilot>);
+
+impl Wheel {
+    fn find(name: &str) -> Result<Wheel> {
+        match name {
+            "zero" => Ok(Wheel(None)),
+            "expert" => Err(Error::Usage(
                 "no expert drives on a recording: it would follow the path that is the measure; name a model or `zero`"
                     .into(),
-            ));
+            )),
+            path => Ok(Wheel(Some(load_pilot(Path::new(path))?))),
         }
-        path => Some(load_pilot(Path::new(path))?),
-    };
-    let mut bar = ShareBar::new(format!("{name} on the recording"), stop);
-    let meters = log.sessions.iter().map(|session| session.path.length_m() as usize + 1).sum();
-    let tally = Tally::new(meters, &mut bar);
-    let reached: Vec<_> = log.sessions.iter().map(|_| std::sync::atomic::AtomicUsize::new(0)).collect();
-    replay(
-        log,
-        options,
-        || {
-            let mut pilot = pilot.clone();
-            Ok(move |view: &RgbImage| match &mut pilot {
-                Some(pilot) => pilot.steer(view.view()),
-                None => Ok(0.0),
-            })
-        },
-        &|session, frame| {
-            let along = frame.moment.along_m as usize;
-            let before = reached[session].swap(along, std::sync::atomic::Ordering::Relaxed);
-            tally.add(along.saturating_sub(before))
-        },
-    )
+    }
+
+    fn driver(&self) -> impl FnMut(&RgbImage) -> Result<f32> + use<> {
+        let mut pilot = self.0.clone();
+        move |view: &RgbImage| match &mut pilot {
+            Some(pilot) => pilot.steer(view.view()),
+            None => Ok(0.0),
+        }
+    }
 }
 
-/// Writes `session_N.csv` for each session and `summary.json`.
-fn write_runs(runs: &[ReplayRun], summary: &ReplaySummary, folder: NewFolder) -> Result<()> {
-    let write = |name: &str, bytes: &[u8]| -> Result<()> {
-        let path: PathBuf = folder.unfinished().join(name);
-        atomic_file::write(&path, bytes).map_err(|error| folder.explain(error))
-    };
-    for (number, run) in runs.iter().enumerate() {
-        write(&format!("session_{}.csv", number + 1), moments_csv(run).as_bytes())?;
+/// What is driven on, and how.
+struct Drive<'a> {
+    log: &'a ReplayLog<'a>,
+    options: &'a ReplayOptions,
+    stop: &'a StopSignal,
+}
+
+impl Drive<'_> {
+    /// Drives along all sessions at once.
+    fn go(&self, wheel: &Wheel, name: &str) -> Result<Vec<ReplayRun>> {
+        let mut bar = ShareBar::new(format!("{name} on the recording"), self.stop);
+        let meters = self.log.sessions.iter().map(|session| session.path.length_m() as usize + 1).sum();
+        let tally = Tally::new(meters, &mut bar);
+        let reached: Vec<_> = self.log.sessions.iter().map(|_| AtomicUsize::new(0)).collect();
+        replay(self.log, self.options, || Ok(wheel.driver()), &|session, frame| {
+            let along = frame.moment.along_m as usize;
+            let before = reached[session].swap(along, Ordering::Relaxed);
+            tally.add(along.saturating_sub(before))
+        })
     }
-    let text = serde_json::to_string_pretty(summary).map_err(|e| Error::data("summary.json", e.to_string()))?;
-    write("summary.json", (text + "\n").as_bytes())?;
-    folder.finish()
+
+    /// Drives along session number `session` alone, and shows every frame to `seen`.
+    fn along(
+        &self,
+        session: usize,
+        wheel: &Wheel,
+        seen: &(dyn Fn(&ReplayFrame) -> Result<()> + Sync),
+    ) -> Result<ReplayRun> {
+        let ReplayLog { recording, geometry, sessions, assumed_speed_mps } = self.log;
+        let sessions = vec![sessions[session].clone()];
+        let log = ReplayLog { recording, geometry: geometry.clone(), sessions, assumed_speed_mps: *assumed_speed_mps };
+        let mut runs = replay(&log, self.options, || Ok(wheel.driver()), &|_, frame| seen(frame))?;
+        Ok(runs.pop().unwrap_or_default())
+    }
+
+    /// Drives along one session after the other, in real time, before those who watch.
+    fn watched(&self, wheel: &Wheel, name: &str, live: &Live) -> Result<Vec<ReplayRun>> {
+        let watch = Mutex::new(WatchRecording::new(live, self.log, name, wheel.0.as_ref(), self.stop));
+        let show = |session: usize, frame: &ReplayFrame| {
+            watch.lock().unwrap_or_else(PoisonError::into_inner).show(session, frame)
+        };
+        (0..self.log.sessions.len()).map(|k| self.along(k, wheel, &|frame| show(k, frame))).collect()
+    }
+
+    /// Films the drive along the first session, whose moments are those of `run`.
+    fn film(&self, wheel: &Wheel, args: &ReplayArgs, run: &ReplayRun, path: &Path) -> Result<()> {
+        let onlooker = match &wheel.0 {
+            Some(pilot) if args.saliency => Some(Onlooker::new(pilot.clone(), true)?),
+            None if args.saliency => {
+                return Err(Error::Usage(format!("{} has no saliency; leave out --saliency", args.model)));
+            }
+            _ => None,
+        };
+        let video = Mutex::new(ReplayVideo::create(path, self.log, run, args.model, args.fps, onlooker)?);
+        let frames = run.moments.len();
+        let mut bar = ShareBar::new("filming", self.stop);
+        let tally = Tally::new(frames.max(1), &mut bar);
+        self.along(0, wheel, &|frame| {
+            video.lock().unwrap_or_else(PoisonError::into_inner).show(frame)?;
+            tally.add(1)
+        })?;
+        let video = video.into_inner().unwrap_or_else(PoisonError::into_inner);
+        let summary = video.finish(&format!("put back: {}", run.interventions))?;
+        drop(bar);
+        tell_video(path, &summary);
+        Ok(())
+    }
 }
 
 fn summary_text(model: &str, s: &ReplaySummary) -> String {

@@ -102,7 +102,11 @@ fn print_summary(summary: &Summary) {
     if let Some(recorded) = &summary.recorded {
         match recorded.rows {
             0 => println!("recorded                   nothing"),
-            rows => println!("recorded                   {rows} rows in {}", recorded.folder.display()),
+            rows => println!(
+                "recorded                   {rows} rows in {}, {} of them by a person",
+                recorded.folder.display(),
+                recorded.by_user
+            ),
         }
         if recorded.dropped > 0 {
             println!("not recorded               {} rows: the disk was too slow", recorded.dropped);

@@ -58,6 +58,10 @@ pub struct SimArgs {
     /// Somebody holds W and steers from one second to another, as in 5:8
     #[arg(long, value_name = "FROM:TO", value_parser = interval)]
     manual: Option<(f64, f64)>,
+    /// Somebody takes the wheel whenever the car is more than 0.6 m beside the middle, and gives it back at 0.2 m; unlike Udacity's
+    /// simulator this one goes on to send pictures, so that `serve --record` records the correction
+    #[arg(long)]
+    correct: bool,
     /// Second at which the scene is left without a word to the server, and entered again
     #[arg(long, value_name = "SECOND")]
     scene_change: Option<f64>,
@@ -97,6 +101,7 @@ struct Summary {
     frames: u64,
     telemetries: u64,
     manual_telemetries: u64,
+    corrected_telemetries: u64,
     commands: u64,
     manuals: u64,
     questions: u64,
@@ -133,6 +138,7 @@ impl Summary {
             frames: report.frames,
             telemetries: report.telemetries,
             manual_telemetries: report.manual_telemetries,
+            corrected_telemetries: report.corrected_telemetries,
             commands: report.commands,
             manuals: report.manuals,
             questions: report.questions,
@@ -161,8 +167,8 @@ impl Summary {
         println!("mean speed                 {:.1} mph", self.mean_speed_mph);
         println!("whiteness                  {:.1} deg/s", self.whiteness_deg_s);
         println!(
-            "telemetry                  {} with picture, {} while driven by hand",
-            self.telemetries, self.manual_telemetries
+            "telemetry                  {} with picture, {} of them while corrected; {} without while driven by hand",
+            self.telemetries, self.corrected_telemetries, self.manual_telemetries
         );
         println!(
             "replies                    {} commands ({:.1}/s), {} `manual`, {} unreadable; {} questions",
@@ -193,6 +199,7 @@ pub fn run(args: SimArgs) -> Result<()> {
             _ => NumberStyle::Strings(DecimalMark::DOT),
         },
         manual_s: args.manual,
+        correct: args.correct,
         scene_change_s: args.scene_change,
         frames: args.frames,
         patience_s: args.patience,

@@ -4,19 +4,25 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use clap::Args;
+use serde::Serialize;
 use steersman_kernels::Isa;
 use steersman_kernels::conv::ConvAlgorithm;
 
 use super::model_arg::model_file;
-use super::progress::{JobDisplay, TrainingDisplay};
+use super::progress::JobDisplay;
 use super::recording_args::RecordingArgs;
+use super::verdict;
 use super::words::counted;
 use super::{RecipeArgs, or_dash, pool, print_json, stop_on_ctrl_c};
 use crate::dataset::held_out::{self, trained_on_held_out};
 use crate::error::{Error, Result};
-use crate::main_job::job::{Job, JobNote, JobRequest, Scope};
+use crate::main_job::dagger_on_log::{self, Round};
+use crate::main_job::job::{Job, JobEvent, JobNote, JobRequest, Scope};
+use crate::main_job::on_recording::judge_run;
 use crate::main_job::{MainJobResult, TrackResult};
+use crate::observer::Observer;
 use crate::recipe::Recipe;
+use crate::replay::RecordingVerdict;
 use crate::report;
 use crate::text::percent;
 use crate::training::{self, RunFolder, TrainRequest, TrainResult, TransferRequest};
@@ -35,6 +41,9 @@ pub struct TrainArgs {
     /// drives in the simulator are recorded under data/recordings/, trained on, and the model drives
     #[arg(value_name = "RECORDING")]
     recordings: Vec<PathBuf>,
+    /// Validate on this recording, whole, instead of on a share of the rows; may be given several times
+    #[arg(long, value_name = "RECORDING", requires = "recordings")]
+    validate: Vec<PathBuf>,
     #[command(flatten)]
     reading: RecordingArgs,
     #[command(flatten)]
@@ -46,7 +55,7 @@ pub struct TrainArgs {
     #[arg(long, default_value_t = 1)]
     seed: u64,
     /// Begin with the weights of a model where layers have the same name and shape; without --recipe, with its recipe
-    #[arg(long, value_name = "MODEL", conflicts_with_all = ["resume", "dagger"])]
+    #[arg(long, value_name = "MODEL", conflicts_with = "resume")]
     from: Option<PathBuf>,
     /// Layers that keep the weights they were given, as in conv1,bn1
     #[arg(long, value_name = "LAYER", requires = "from", value_delimiter = ',')]
@@ -61,7 +70,7 @@ pub struct TrainArgs {
     #[arg(long, default_value_t = 1024, value_name = "MIB")]
     cache: usize,
     /// Go on with a run that was stopped, as if it had never stopped
-    #[arg(long, value_name = "RUN", conflicts_with_all = ["recordings", "recipe", "overrides", "out", "seed", "cache", "algorithm"])]
+    #[arg(long, value_name = "RUN", conflicts_with_all = ["recordings", "validate", "recipe", "overrides", "out", "seed", "cache", "algorithm"])]
     resume: Option<PathBuf>,
     /// With --resume: where the recordings of the run are now, in their order, if they were moved
     #[arg(long = "recordings", value_name = "RECORDING", requires = "resume", num_args = 1..)]
@@ -69,9 +78,10 @@ pub struct TrainArgs {
     /// Without a recording: runs of the finished model on each track, of one lap
     #[arg(long, default_value_t = 1, conflicts_with_all = ["recordings", "resume"])]
     runs: usize,
-    /// Without a recording: after the training the model drives N times through the training tracks, the expert labels what
-    /// it met there, and training begins anew on all recordings (DAgger)
-    #[arg(long, default_value_t = 0, value_name = "N", conflicts_with_all = ["recordings", "resume"],
+    /// After the training the model drives N times, and what it met is trained on as well (DAgger): without a recording through
+    /// the training tracks, where the expert labels it and training begins anew; on a recording along the driven path, which says
+    /// how to steer back, and training goes on for half as many epochs
+    #[arg(long, default_value_t = 0, value_name = "N", conflicts_with = "resume",
           value_parser = clap::value_parser!(u32).range(..=20))]
     dagger: u32,
     /// Train on recordings of held-out tracks all the same
@@ -83,6 +93,19 @@ pub struct TrainArgs {
     /// Print one JSON object as the last line
     #[arg(long)]
     json: bool,
+}
+
+/// What `train RECORDING --json` prints.
+#[derive(Serialize)]
+struct Report<'a> {
+    #[serde(flatten)]
+    training: &'a TrainResult,
+    /// What the model is worth on the recordings.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    on_recording: Option<&'a RecordingVerdict>,
+    /// With `--dagger`: the same of the first training and of each round.
+    #[serde(skip_serializing_if = "<[&RecordingVerdict]>::is_empty")]
+    dagger: &'a [&'a RecordingVerdict],
 }
 
 pub fn run(args: TrainArgs) -> Result<()> {
@@ -139,11 +162,13 @@ pub fn run(args: TrainArgs) -> Result<()> {
         );
         return Ok(());
     }
-    let mut display = TrainingDisplay::new();
+    let mut display = JobDisplay::new(&stop);
+    let mut rounds = Vec::new();
     let (folder, result) = match args.resume {
         Some(folder) => {
             let moved = (!args.moved.is_empty()).then_some(&args.moved[..]);
-            let result = pool.install(|| training::resume_with(&folder, moved, args.profile, &mut display, &stop));
+            let mut observer = |event| display.observe(JobEvent::Training(event));
+            let result = pool.install(|| training::resume_with(&folder, moved, args.profile, &mut observer, &stop));
             (folder, result)
         }
         None => {
@@ -156,6 +181,8 @@ pub fn run(args: TrainArgs) -> Result<()> {
             let (out, claimed) = out_or_next(args.out, &recipe.name)?;
             let request = TrainRequest {
                 recordings,
+                validate: args.reading.expand(args.validate)?,
+                also: Vec::new(),
                 said: args.reading.said(),
                 recipe,
                 out: out.clone(),
@@ -165,18 +192,48 @@ pub fn run(args: TrainArgs) -> Result<()> {
                 profile: args.profile,
                 algorithm: args.algorithm,
             };
-            let result = claimed.settle(pool.install(|| training::train(request, &mut display, &stop)));
+            for round in 1..=args.dagger {
+                dagger_on_log::require_free(&out, round)?;
+            }
+            let mut observer = |event| display.observe(JobEvent::Training(event));
+            let result = claimed.settle(pool.install(|| training::train(request.clone(), &mut observer, &stop)));
+            let result = result.and_then(|result| {
+                if args.dagger > 0 {
+                    pool.install(|| judge_or_say(&out));
+                    dagger_on_log::rounds(&out, args.dagger, &request, &mut display, &stop, &mut rounds)?;
+                }
+                Ok(result)
+            });
             (out, result)
         }
     };
     display.finish();
-    let result = pool.install(|| explain_stop(result, Some(&folder)))?;
-    pool.install(|| write_report(&folder));
+    let last = rounds.last().map_or(&folder, |round: &Round| &round.folder).clone();
+    let result = pool.install(|| explain_stop(result, Some(&last)))?;
+    let first = (args.dagger > 0).then(|| RunFolder::open(&folder)?.replay()).transpose()?.flatten();
+    let (result, verdict) = match rounds.last() {
+        Some(round) => (round.training.clone(), Some(round.verdict.clone())),
+        None => (result, pool.install(|| judge_or_say(&folder))),
+    };
+    pool.install(|| write_report(&last));
+    let by_round: Vec<&RecordingVerdict> = first.iter().chain(rounds.iter().map(|round| &round.verdict)).collect();
     if args.json {
-        return print_json(&result);
+        let dagger = if args.dagger > 0 { &by_round[..] } else { &[] };
+        return print_json(&Report { training: &result, on_recording: verdict.as_ref(), dagger });
     }
     print_training(&result);
+    if let Some(verdict) = verdict {
+        print!("{}", verdict::table(&verdict, result.best_epoch));
+    }
+    if args.dagger > 0 {
+        print!("{}", verdict::rounds(&by_round));
+    }
     Ok(())
+}
+
+/// Judges the model of the run in `folder` on its recordings. The run is saved; a judgement that cannot be made takes nothing from it.
+fn judge_or_say(folder: &Path) -> Option<RecordingVerdict> {
+    judge_run(folder).inspect_err(|error| eprintln!("note: the model was not judged on the recording: {error}")).ok()
 }
 
 /// What the main job is going to do, and about how long it takes on `threads` threads.

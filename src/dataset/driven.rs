@@ -37,9 +37,14 @@ pub struct DrivenSessions {
 impl DrivenSessions {
     /// Dead reckoning from the steering, speed and time of the rows of `recording`.
     pub fn of(recording: &Recording, geometry: CarGeometry) -> DrivenSessions {
+        DrivenSessions::of_stretches(recording, geometry, &recording.sessions)
+    }
+
+    /// The same for `stretches` of its rows, each within a session, as if they were sessions of their own.
+    pub fn of_stretches(recording: &Recording, geometry: CarGeometry, stretches: &[Range<usize>]) -> DrivenSessions {
         let known = recording.rows.iter().any(|row| row.speed_mph.is_finite());
         let assumed_mps = ASSUMED_WHEELBASES_PER_S * geometry.wheelbase_m;
-        let sessions = (recording.sessions.iter())
+        let sessions = (stretches.iter())
             .map(|rows| {
                 let of_session = &recording.rows[rows.clone()];
                 // A row without a speed keeps the last one.

@@ -32,7 +32,7 @@ pub use recording::{Recording, Row, SESSION_GAP_MS, View};
 pub use rows::ImageCheck;
 pub use samples::{
     Balance, Correction, Flip, Group, Item, LabelKind, LabelSpec, Mirror, SampleSpec, Targets, augment, leak, loader,
-    split,
+    split, takeover, whole,
 };
 pub use unusable::{Reason, Tally, Unusable};
 

@@ -57,6 +57,8 @@ pub struct Row {
     pub brake: f32,
     /// Speed in miles per hour. NaN where it was not recorded.
     pub speed_mph: f32,
+    /// Whether a person took the wheel from a model that drove: the log has a column `mode` that says `user`.
+    pub taken_over: bool,
     /// Time in milliseconds; only differences within a recording mean something.
     pub time_ms: i64,
     /// Line of the log, from 1.

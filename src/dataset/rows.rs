@@ -49,6 +49,8 @@ pub(crate) struct Entry {
     pub throttle: f32,
     pub brake: f32,
     pub speed_mph: f32,
+    /// Whether a person took the wheel from a model that drove.
+    pub taken_over: bool,
     /// Time, where the row has one.
     pub time_ms: Option<i64>,
     /// Folder or session it was written in: rows of another one belong to another drive.
@@ -225,6 +227,7 @@ impl<'a> Rows<'a> {
             throttle: row.throttle,
             brake: row.brake,
             speed_mph: row.speed_mph,
+            taken_over: row.taken_over,
             time_ms: row.time_ms.unwrap_or(i64::MIN),
             line: row.line,
             source,

@@ -45,6 +45,7 @@ pub(crate) fn recording_of(steering: &[f32], step_ms: i64) -> Recording {
         throttle: 1.0,
         brake: 0.0,
         speed_mph: 20.0,
+        taken_over: false,
         time_ms: i as i64 * step_ms,
         line: i as u32 + 1,
         source: 0,

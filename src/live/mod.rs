@@ -4,7 +4,7 @@
 //! messages: the program sends the [`State`] and pictures, the page sends requests. The page asks for each frame, so a slow
 //! page skips frames and delays nothing.
 //!
-//! [`Watch`] shows a closed-loop drive in real time. [`ManualDrive`] lets a person drive with the page and records the drive;
+//! [`Watch`] shows a closed-loop drive in real time, [`WatchRecording`] one on recorded pictures. [`ManualDrive`] lets a person drive with the page and records the drive;
 //! [`Shares`] says what the recording covers so far.
 //!
 //! A page of another site must not drive the car. So the `Host` of a request must be this machine (a site can let its name
@@ -18,9 +18,11 @@ mod messages;
 mod real_time;
 mod server;
 mod watch;
+mod watch_recording;
 
 pub use coverage::Shares;
 pub use manual::{ManualDrive, ManualSummary};
 pub use messages::{Hello, Manual, State, TrailPoint};
 pub use server::{DEFAULT_PORT, Live};
 pub use watch::Watch;
+pub use watch_recording::WatchRecording;

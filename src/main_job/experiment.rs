@@ -194,6 +194,8 @@ pub fn run(
             observer.observe(ExperimentEvent::Job(JobEvent::Notice(format!("{variant}, seed {seed}"))))?;
             let request = TrainRequest {
                 recordings: plan.recordings.clone(),
+                validate: Vec::new(),
+                also: Vec::new(),
                 said: plan.said.clone(),
                 recipe: recipe.clone(),
                 out: folder.path().join(format!("{variant}-{seed}")),

@@ -54,7 +54,7 @@ impl JobNote {
     }
 }
 
-fn write_json(folder: &Path, name: &str, value: &impl Serialize) -> Result<()> {
+pub(super) fn write_json(folder: &Path, name: &str, value: &impl Serialize) -> Result<()> {
     let text = serde_json::to_string_pretty(value).map_err(|e| Error::data(folder.join(name), e.to_string()))?;
     checksums::write(folder, name, (text + "\n").as_bytes())
 }
@@ -78,7 +78,7 @@ pub enum JobEvent {
 }
 
 /// Runs `work` between [`JobEvent::Begin`] and [`JobEvent::End`]. Its progress goes to `observer`, and `stop` ends it.
-fn observed<T>(
+pub(super) fn observed<T>(
     what: String,
     observer: &mut (dyn Observer<JobEvent> + Send),
     stop: &StopSignal,
@@ -174,6 +174,8 @@ impl<'a> Job<'a> {
         let profile = self.profile;
         let training = self.train(TrainRequest {
             recordings,
+            validate: Vec::new(),
+            also: Vec::new(),
             said: Description::default(),
             recipe,
             out,
@@ -250,6 +252,8 @@ impl<'a> Job<'a> {
         let (seed, cache_mib, profile) = (info.seed, info.cache_mib, self.profile);
         self.train(TrainRequest {
             recordings,
+            validate: Vec::new(),
+            also: Vec::new(),
             said: Description::default(),
             recipe,
             out,
@@ -325,7 +329,7 @@ pub fn training_set(
 }
 
 /// The run folder of DAgger's round `round`, where `folder` is that of round `from` (0: the first training).
-fn dagger_folder(folder: &Path, from: u32, round: u32) -> Result<PathBuf> {
+pub(super) fn dagger_folder(folder: &Path, from: u32, round: u32) -> Result<PathBuf> {
     let name = folder.file_name().map(|name| name.to_string_lossy().into_owned());
     let name = name.ok_or_else(|| Error::Usage(format!("{}: a folder with a name is needed", folder.display())))?;
     let first = name.strip_suffix(&format!("-dagger-{from}")).unwrap_or(&name);

@@ -1,8 +1,11 @@
 //! The main job: record the expert, train on it, drive where it was trained and where it was not.
 
 pub mod dagger;
+pub mod dagger_on_log;
 pub mod experiment;
 pub mod job;
+pub mod on_recording;
+pub mod replay_experiment;
 pub mod training_set;
 
 use std::path::Path;

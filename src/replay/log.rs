@@ -1,5 +1,7 @@
 //! What is driven on: the sessions of a recording with their paths, and their pictures.
 
+use std::ops::Range;
+
 use crate::dataset::{DrivenSession, DrivenSessions, Recording, View};
 use crate::error::{Error, Result};
 use crate::geometry::CarGeometry;
@@ -29,20 +31,28 @@ impl<'a> ReplayLog<'a> {
     ///
     /// [`Error::Data`] if no session is.
     pub fn new(recording: &'a Recording, geometry: CarGeometry) -> Result<ReplayLog<'a>> {
-        let log = ReplayLog::of_any_length(recording, geometry);
-        let sessions: Vec<_> = log.sessions.into_iter().filter(|s| s.path.length_m() >= MIN_PATH_M).collect();
-        if sessions.is_empty() {
+        let log = ReplayLog::of_stretches(recording, geometry, &recording.sessions);
+        if log.sessions.is_empty() {
             return Err(Error::data(
                 &recording.path,
                 format!("no session has a path of {MIN_PATH_M} m or more, so nothing can be driven on this recording"),
             ));
         }
-        Ok(ReplayLog { sessions, ..log })
+        Ok(log)
     }
 
     /// All sessions of `recording`, also those that are too short to be driven.
     pub fn of_any_length(recording: &'a Recording, geometry: CarGeometry) -> ReplayLog<'a> {
         let DrivenSessions { geometry, sessions, assumed_speed_mps } = DrivenSessions::of(recording, geometry);
+        ReplayLog { recording, geometry, sessions, assumed_speed_mps }
+    }
+
+    /// Those of `stretches` of the rows of `recording`, each within a session, that are long enough to be driven, as sessions of
+    /// their own.
+    pub fn of_stretches(recording: &'a Recording, geometry: CarGeometry, stretches: &[Range<usize>]) -> ReplayLog<'a> {
+        let driven = DrivenSessions::of_stretches(recording, geometry, stretches);
+        let DrivenSessions { geometry, mut sessions, assumed_speed_mps } = driven;
+        sessions.retain(|session| session.path.length_m() >= MIN_PATH_M);
         ReplayLog { recording, geometry, sessions, assumed_speed_mps }
     }
 }

@@ -12,11 +12,13 @@ mod fit;
 mod log;
 mod run;
 mod trust;
+mod verdict;
 
 pub use fit::{CameraFit, fit_camera};
 pub use log::{Frames, ReplayLog};
 pub use run::{
-    MAX_OFFSET_M, MAX_TURN_DEG, ReplayFrame, ReplayMoment, ReplayOptions, ReplayRun, ReplaySummary, moments_csv,
-    replay, summarise,
+    DRIVE_HZ, MAX_OFFSET_M, MAX_TURN_DEG, ReplayFrame, ReplayMoment, ReplayOptions, ReplayRun, ReplaySummary, replay,
+    summarise,
 };
 pub use trust::{WarpCheck, side_camera_check};
+pub use verdict::{RecordingVerdict, Side, SideVerdict, Stretch, judge, pieces};

@@ -10,7 +10,7 @@ use crate::geometry::{CarGeometry, LookAhead, Offset, PixelGrid, ViewWarp};
 use crate::picture::RgbImage;
 
 /// Frames that a driver sees in each second, as in the simulator.
-const DRIVE_HZ: f64 = 20.0;
+pub const DRIVE_HZ: f64 = 20.0;
 /// Distance from the path at which the car is put back, m (NVIDIA 2016).
 pub const MAX_OFFSET_M: f64 = 1.0;
 /// Turn from the path at which the car is put back, deg.
@@ -279,28 +279,4 @@ pub fn summarise(runs: &[ReplayRun], seconds: f64) -> ReplaySummary {
         frames: offsets.len(),
         frames_per_second: offsets.len() as f64 / seconds.max(1e-9),
     }
-}
-
-/// The moments of a drive as CSV, one a line, with a header.
-pub fn moments_csv(run: &ReplayRun) -> String {
-    let mut text =
-        String::from("time_s,row,x_m,y_m,heading_deg,along_m,offset_m,turn_deg,steering,pursuit,speed_mps,put_back\n");
-    for m in &run.moments {
-        text += &format!(
-            "{:.3},{},{:.4},{:.4},{:.3},{:.3},{:.4},{:.3},{:.6},{},{:.3},{}\n",
-            m.time_s,
-            m.row,
-            m.x_m,
-            m.y_m,
-            m.heading_deg,
-            m.along_m,
-            m.offset_m,
-            m.turn_deg,
-            m.steering,
-            m.pursuit.map_or(String::new(), |steering| format!("{steering:.6}")),
-            m.speed_mps,
-            u8::from(m.put_back)
-        );
-    }
-    text
 }

@@ -8,6 +8,7 @@
 
 pub mod charts;
 pub mod explain;
+pub mod on_recording;
 pub mod pages;
 pub mod tone;
 #[cfg(feature = "video")]

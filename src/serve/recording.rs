@@ -1,6 +1,6 @@
 //! Records a drive: the pictures and the commands, in the format of Udacity's simulator.
 //!
-//! The log has the seven columns of the original. Left and right stay empty, because telemetry has one camera. A picture is
+//! The log has the seven columns of the original, and `mode`: `user` where a person steered, else `pilot`. Left and right stay empty, because telemetry has one camera. A picture is
 //! stored with the bytes that arrived. Another thread writes, so that a slow disk costs rows and not time.
 
 use std::fs::{self, File};
@@ -12,7 +12,7 @@ use std::thread::JoinHandle;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use super::helm::FrameTime;
-use crate::dataset::udacity_writer::{HEADER, picture_name, write_row};
+use crate::dataset::udacity_writer::{HEADER_WITH_MODE, picture_name, write_row};
 use crate::error::{Error, Result};
 use crate::files::new_folder::create_now;
 use crate::udacity::Command;
@@ -34,6 +34,8 @@ pub struct Row {
     pub command: Command,
     /// Speed, mph.
     pub speed_mph: f64,
+    /// Whether a person steered.
+    pub by_user: bool,
 }
 
 /// A finished recording.
@@ -43,6 +45,8 @@ pub struct Recorded {
     pub folder: PathBuf,
     /// Rows written.
     pub rows: u64,
+    /// Those of them in which a person steered.
+    pub by_user: u64,
     /// Rows that were left out because the disk was too slow.
     pub dropped: u64,
 }
@@ -59,6 +63,8 @@ pub struct Recorder {
 #[derive(Debug)]
 struct State {
     dropped: u64,
+    /// Rows in which a person steered.
+    by_user: u64,
     last_ms: u64,
     /// Where simulated time 0 lies, ms since 1970.
     simulated_from_ms: u64,
@@ -92,12 +98,12 @@ impl Recorder {
         let (sender, receiver) = sync_channel(MAX_QUEUED);
         let thread = std::thread::Builder::new().name("recording".into());
         let writer = thread.spawn(move || write_all(&images, &log, file, &receiver)).map_err(Error::io(folder))?;
-        let state = State { dropped: 0, last_ms: 0, simulated_from_ms: now_ms(), simulated_s: None };
+        let state = State { dropped: 0, by_user: 0, last_ms: 0, simulated_from_ms: now_ms(), simulated_s: None };
         Ok(Recorder { folder: folder.into(), sender, writer, state: Mutex::new(state) })
     }
 
     /// Copies `image` and hands a row to the writer. Never waits.
-    pub fn push(&self, time: FrameTime, image: &[u8], command: Command, speed_mph: f64) -> Queued {
+    pub fn push(&self, time: FrameTime, image: &[u8], command: Command, speed_mph: f64, by_user: bool) -> Queued {
         let mut state = self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
         let taken_ms = match time {
             FrameTime::Arrival(_) => {
@@ -116,10 +122,11 @@ impl Recorder {
         };
         // The names must differ, and the rows keep the order of the frames.
         let time_ms = taken_ms.clamp(state.last_ms + 1, state.last_ms.max(now_ms()) + 24 * 3_600_000);
-        let row = Row { time_ms, image: image.to_vec(), command, speed_mph };
+        let row = Row { time_ms, image: image.to_vec(), command, speed_mph, by_user };
         match self.sender.try_send(row) {
             Ok(()) => {
                 state.last_ms = time_ms;
+                state.by_user += u64::from(by_user);
                 Queued::Yes
             }
             Err(TrySendError::Full(_)) => {
@@ -143,11 +150,11 @@ impl Recorder {
             let kept = format!("the {rows} rows before are in {}", folder.display());
             return Err(Error::EndedEarly { cause: Box::new(cause), kept });
         }
-        let dropped = state.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner).dropped;
+        let State { dropped, by_user, .. } = state.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner);
         if rows == 0 {
             remove_empty(&folder)?;
         }
-        Ok(Recorded { folder, rows, dropped })
+        Ok(Recorded { folder, rows, by_user, dropped })
     }
 }
 
@@ -175,7 +182,7 @@ fn write_all(images: &Path, log: &Path, mut file: BufWriter<File>, rows: &Receiv
     let mut good_len = 0;
     let mut write = |row: Option<Row>, good_len: &mut u64| -> Result<()> {
         match row {
-            None => file.write_all(HEADER.as_bytes()).and_then(|()| file.flush()).map_err(Error::io(log))?,
+            None => file.write_all(HEADER_WITH_MODE.as_bytes()).and_then(|()| file.flush()).map_err(Error::io(log))?,
             Some(row) => write_row_and_picture(images, log, &mut file, &row)?,
         }
         *good_len = file.get_ref().metadata().map_err(Error::io(log))?.len();
@@ -208,7 +215,13 @@ fn write_row_and_picture(images: &Path, log: &Path, file: &mut BufWriter<File>, 
     let Command { steering, throttle } = row.command;
     let (accelerator, brake, speed) = (throttle.max(0.0), (-throttle).max(0.0), row.speed_mph as f32);
     let picture = format!("IMG/{name}");
-    write_row(&mut *file, ", ", [&picture, &"", &""], [steering, accelerator, brake, speed])
+    let mut line = Vec::new();
+    write_row(&mut line, ", ", [&picture, &"", &""], [steering, accelerator, brake, speed])
+        .and_then(|()| {
+            line.pop();
+            writeln!(line, ", {}", if row.by_user { "user" } else { "pilot" })
+        })
+        .and_then(|()| file.write_all(&line))
         .and_then(|()| file.flush())
         .map_err(Error::io(log))
 }
@@ -236,16 +249,19 @@ mod tests {
         let image = image();
         for frame in 0..20 {
             let command = Command { steering: frame as f32 / 20.0 - 0.5, throttle: frame as f32 / 10.0 - 1.0 };
-            let queued = recorder.push(FrameTime::Simulated(f64::from(frame) * 0.06), &image, command, 12.5);
+            let time = FrameTime::Simulated(f64::from(frame) * 0.06);
+            let queued = recorder.push(time, &image, command, 12.5, frame >= 15);
             assert_eq!(queued, Queued::Yes);
         }
         let recorded = recorder.finish().unwrap();
-        assert_eq!((recorded.rows, recorded.dropped), (20, 0));
+        assert_eq!((recorded.rows, recorded.by_user, recorded.dropped), (20, 5, 0));
         let recording = dataset::load(&folder).unwrap();
         assert_eq!((recording.rows.len(), recording.sessions.len()), (20, 1));
         assert!(recording.notices.is_empty(), "{:?}", recording.notices);
         let row = &recording.rows[4];
         assert_eq!((row.steering, row.throttle, row.brake, row.speed_mph), (-0.3, 0.0, 0.6, 12.5));
+        let taken_over: Vec<usize> = (0..20).filter(|&row| recording.rows[row].taken_over).collect();
+        assert_eq!(taken_over, [15, 16, 17, 18, 19]);
         assert!(Recorder::start(&folder).is_err(), "an existing folder is refused");
         assert_eq!(dataset::load(&folder).unwrap().rows.len(), 20);
     }
@@ -256,7 +272,8 @@ mod tests {
         let folder = scratch.path().join("drive");
         let recorder = Recorder::start(&folder).unwrap();
         let now = FrameTime::Arrival(Instant::now());
-        let queued = (0..30).filter(|_| recorder.push(now, b"x", Command::default(), 0.0) == Queued::Yes).count();
+        let queued =
+            (0..30).filter(|_| recorder.push(now, b"x", Command::default(), 0.0, false) == Queued::Yes).count();
         let recorded = recorder.finish().unwrap();
         assert_eq!(recorded.rows, queued as u64);
         assert_eq!(fs::read_dir(folder.join("IMG")).unwrap().count(), queued);
@@ -268,7 +285,10 @@ mod tests {
         let folder = scratch.path().join("drive");
         let recorder = Recorder::start(&folder).unwrap();
         for time_s in [0.0, 0.06, 0.1, 0.0, 0.06, 0.1] {
-            assert_eq!(recorder.push(FrameTime::Simulated(time_s), &image(), Command::default(), 0.0), Queued::Yes);
+            assert_eq!(
+                recorder.push(FrameTime::Simulated(time_s), &image(), Command::default(), 0.0, false),
+                Queued::Yes
+            );
         }
         recorder.finish().unwrap();
         let recording = dataset::load(&folder).unwrap();

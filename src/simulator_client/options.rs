@@ -34,6 +34,9 @@ pub struct ClientOptions {
     pub numbers: NumberStyle,
     /// Start and end of driving by hand with W held, s of simulated time.
     pub manual_s: Option<(f64, f64)>,
+    /// Whether somebody takes the wheel when the car is far from the line, and gives it back near it. Telemetry with its picture goes
+    /// on, and says so.
+    pub correct: bool,
     /// Simulated time at which the scene is left and entered again, s. The connection ends without a close frame, and the car
     /// starts anew.
     pub scene_change_s: Option<f64>,
@@ -53,6 +56,7 @@ impl Default for ClientOptions {
             time_mode: TimeMode::RealTime { fps: 60.0 },
             numbers: NumberStyle::Strings(DecimalMark::DOT),
             manual_s: None,
+            correct: false,
             scene_change_s: None,
             frames: None,
             patience_s: 30.0,
@@ -69,6 +73,8 @@ pub struct ClientReport {
     pub frames: u64,
     /// Telemetries sent with a picture.
     pub telemetries: u64,
+    /// Of these, telemetries while somebody corrected the car.
+    pub corrected_telemetries: u64,
     /// Telemetries sent as `null` while a person drove by hand.
     pub manual_telemetries: u64,
     /// Commands that could be read.

@@ -58,10 +58,14 @@ pub fn drive(track: &Track, options: &ClientOptions, observer: &mut dyn Observer
     Ok(ClientReport { run: driven?, ..report })
 }
 
+/// Distance from the line at which somebody takes the wheel, and at which the model has it again, m.
+const CORRECT_M: f64 = 0.6;
+const RELEASE_M: f64 = 0.2;
+
 /// A telemetry that waits for its reply.
 struct Sent {
     at: Instant,
-    /// Whether it was `null`: a person drives by hand.
+    /// Whether a person drives by hand.
     by_hand: bool,
 }
 
@@ -80,6 +84,8 @@ struct Scene<'a> {
     due: u64,
     /// The last command: steering and throttle.
     command: (f32, f32),
+    /// Whether somebody corrects the car.
+    correcting: bool,
     /// The last telemetry, until its reply arrives.
     sent: Option<Sent>,
     /// Time without a reply, s.
@@ -112,6 +118,7 @@ impl<'a> Scene<'a> {
             message: String::new(),
             due: 0,
             command: (0.0, 0.0),
+            correcting: false,
             sent: None,
             silence_s: 0.0,
             since: None,
@@ -184,6 +191,7 @@ impl<'a> Scene<'a> {
 
     /// Sends telemetry for every token and waits for a reply to it.
     fn exchange(&mut self, closed_loop: &ClosedLoop) -> Result<()> {
+        self.watch_over(closed_loop);
         while let Some(event) = self.link.poll() {
             self.handle(event)?;
         }
@@ -227,6 +235,7 @@ impl<'a> Scene<'a> {
     fn frame(&mut self, closed_loop: &mut ClosedLoop, clock: &mut FrameClock) -> Result<()> {
         self.progress(closed_loop)?;
         self.report.frames += 1;
+        self.watch_over(closed_loop);
         let passed_s = clock.frame();
         while clock.step_is_due() && closed_loop.goes_on() {
             let (steering, throttle) = self.wheel(closed_loop);
@@ -341,8 +350,17 @@ impl<'a> Scene<'a> {
         self.options.manual_s.is_some_and(|(from, until)| (from..until).contains(&time_s))
     }
 
+    /// Takes the wheel if the car is far from the line, and gives it back near it.
+    fn watch_over(&mut self, closed_loop: &ClosedLoop) {
+        let beside_m = closed_loop.simulation().cte_m().abs();
+        self.correcting = self.options.correct && beside_m > if self.correcting { RELEASE_M } else { CORRECT_M };
+    }
+
     /// Steering and throttle: the command of the server or, by hand, the steering of the expert with W held.
     fn wheel(&self, closed_loop: &ClosedLoop) -> (f32, f32) {
+        if self.correcting {
+            return (pursuit(closed_loop.simulation()) as f32, self.command.1);
+        }
         if self.by_hand(closed_loop) { (pursuit(closed_loop.simulation()) as f32, 1.0) } else { self.command }
     }
 
@@ -369,13 +387,15 @@ impl<'a> Scene<'a> {
                 throttle: closed_loop.controls().throttle.max(0.0),
                 speed_mph: telemetry_mph(simulation.car.speed_mps),
                 cte_m,
+                by_user: self.correcting,
                 time_s: (self.options.time_mode == TimeMode::Lockstep).then(|| simulation.time_s()),
                 image: &self.image,
             };
             print_telemetry(&mut self.message, &readings, mark);
             self.report.telemetries += 1;
+            self.report.corrected_telemetries += u64::from(self.correcting);
         }
-        self.sent = Some(Sent { at: Instant::now(), by_hand });
+        self.sent = Some(Sent { at: Instant::now(), by_hand: by_hand || self.correcting });
         self.link.send(&self.message);
         Ok(())
     }

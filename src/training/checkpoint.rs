@@ -49,11 +49,12 @@ pub(super) struct Progress {
     pub learning_rate: f64,
     /// The epoch of the best weights, from 1.
     pub best_epoch: u32,
-    /// Validation loss of the best weights.
+    /// Validation error of the best weights, by what the recipe keeps them.
+    // The name is that of the format.
     pub best_val_mse: Option<f64>,
-    /// Epochs since the validation loss last improved by the recipe's `min_delta`.
+    /// Epochs since that error last improved by the recipe's `min_delta`.
     pub epochs_since_improvement: u32,
-    /// Validation loss at the last improvement.
+    /// The error at the last improvement.
     pub improved_val_mse: Option<f64>,
     /// State of the learning-rate schedule.
     pub plateau: Plateau,

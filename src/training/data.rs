@@ -6,14 +6,18 @@ use std::sync::Arc;
 use ndarray::ArrayView4;
 use sha2::{Digest, Sha256};
 
+use super::run_folder::RunInfo;
 use crate::dataset::cache::{CacheSpec, Overflow};
 use crate::dataset::leak::LeakAudit;
 use crate::dataset::loader::{Batch, Loader, LoaderSpec};
 use crate::dataset::split::{Split, split};
-use crate::dataset::{self, Description, ImageCheck, Item, Recording, Targets, View};
+use crate::dataset::takeover;
+use crate::dataset::whole::split_whole;
+use crate::dataset::{self, Description, DrivenSessions, ImageCheck, Item, Recording, Targets, View};
 use crate::engine::tensor::Shape;
 use crate::error::{Error, Result};
 use crate::files::atomic_file;
+use crate::geometry::LookAhead;
 use crate::recipe::Recipe;
 
 /// The images of `batch`, `(n, c, h, w)`, for a network whose input is `input`.
@@ -21,10 +25,23 @@ pub(super) fn images(input: Shape, batch: &Batch) -> ArrayView4<'_, f32> {
     ArrayView4::from_shape(input.batch(batch.n), &batch.x).expect("a loader makes images of the network's input shape")
 }
 
+/// Where the recordings of a run are.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Sources<'a> {
+    /// Those that are split, or trained on if there are some to validate on.
+    pub paths: &'a [PathBuf],
+    /// The validation side, if not a share of the rows of the first.
+    pub validate: &'a [PathBuf],
+    /// Views that a model met, which are always trained on.
+    pub also: &'a [PathBuf],
+}
+
 /// Recordings that have been read and split.
 #[derive(Debug)]
 pub(crate) struct Data {
     recordings: Arc<[Recording]>,
+    /// The number of those that can be driven on.
+    driven: usize,
     targets: Arc<Targets>,
     split: Split,
     leak: LeakAudit,
@@ -33,13 +50,24 @@ pub(crate) struct Data {
 }
 
 impl Data {
-    /// Reads the recordings, of which the user says `said`, and splits them as `recipe` says.
+    /// The data of the run `info`, with `cache_mib` for decoded images.
+    ///
+    /// # Errors
+    ///
+    /// As [`Data::prepare`].
+    pub fn of_run(info: &RunInfo, recipe: &Recipe, cache_mib: usize) -> Result<Data> {
+        let sources = Sources { paths: &info.recordings, validate: &info.validate, also: &info.also };
+        Data::prepare(sources, &info.said, recipe, info.seed, cache_mib)
+    }
+
+    /// Reads the recordings, of which the user says `said`, and splits them as `recipe` says; with recordings to validate on, these
+    /// are the validation side and all others the training side.
     ///
     /// # Errors
     ///
     /// [`Error::Io`] and [`Error::Data`] for recordings that cannot be used, or if a side would be empty.
     pub fn prepare(
-        paths: &[PathBuf],
+        Sources { paths, validate, also }: Sources,
         said: &Description,
         recipe: &Recipe,
         seed: u64,
@@ -47,16 +75,30 @@ impl Data {
     ) -> Result<Data> {
         let mut recordings = Vec::new();
         let mut notices = Vec::new();
-        for path in paths {
+        for path in paths.iter().chain(validate).chain(also) {
             let mut recording = dataset::load_with(path, said, ImageCheck::Verify)?;
             recording.require_usable()?;
             recording.hash_pictures();
             notices.extend(recording.notices_for(&recipe.preprocessing));
             recordings.push(recording);
         }
-        let targets = recipe.targets(&recordings);
+        let driven = paths.len() + validate.len();
+        let targets = recipe.targets(&recordings[..driven]);
         notices.extend_from_slice(targets.notices());
-        let split = split(&recordings, &targets, &recipe.split, &recipe.samples, &recipe.balance, seed)?;
+        let mut split = match validate {
+            [] => split(&recordings[..driven], &targets, &recipe.split, &recipe.samples, &recipe.balance, seed)?,
+            _ => {
+                let of_split = &recordings[..driven];
+                split_whole(of_split, paths.len(), &targets, &recipe.samples, &recipe.balance, seed)?
+            }
+        };
+        let targets = targets.with_views(&recordings[driven..]);
+        split.train_on(&recordings, driven)?;
+        let taken_over = takeover::weigh(&mut split.training, &recordings, &recipe.samples, seed);
+        if taken_over > 0 {
+            let weight = recipe.samples.takeover_weight;
+            split.notices.push(format!("{taken_over} training rows in which a person took over count {weight} times"));
+        }
         notices.push(split.summary());
         let leak = LeakAudit::of(&split, &recordings);
         notices.push(leak.summary());
@@ -72,7 +114,7 @@ impl Data {
                 folder: None,
             },
         };
-        Ok(Data { recordings: recordings.into(), targets: targets.into(), split, leak, loader, notices })
+        Ok(Data { recordings: recordings.into(), driven, targets: targets.into(), split, leak, loader, notices })
     }
 
     /// Messages for the user about the recordings and the split.
@@ -83,6 +125,16 @@ impl Data {
     /// The recordings, in the order of the command line.
     pub fn recordings(&self) -> &[Recording] {
         &self.recordings
+    }
+
+    /// Those of them that were driven along a path, not views that a model met.
+    pub fn driven(&self) -> &[Recording] {
+        &self.recordings[..self.driven]
+    }
+
+    /// The labels of the recordings.
+    pub fn targets(&self) -> &Targets {
+        &self.targets
     }
 
     /// Both sides.
@@ -137,6 +189,29 @@ impl Data {
             }
         }
         hash.finalize().iter().take(16).map(|byte| format!("{byte:02x}")).collect()
+    }
+
+    /// The steering that follows the driven path, for each row of each recording where there is one.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Data`] if no row of the validation side has one.
+    pub fn path_labels(&self) -> Result<Vec<Vec<Option<f32>>>> {
+        let labels = |recording: &Recording| {
+            let geometry = recording.geometry.clone();
+            let look_ahead = LookAhead::usual(&geometry);
+            DrivenSessions::of(recording, geometry).path_labels(look_ahead)
+        };
+        let labels: Vec<Vec<Option<f32>>> = self.recordings.iter().map(labels).collect();
+        let validation = &self.split.validation;
+        if !validation.is_empty()
+            && validation.iter().all(|item| labels[usize::from(item.recording)][item.row as usize].is_none())
+        {
+            let message = "keep_by = \"path\": no validation row has a path ahead of it, because the car stands or the sessions are \
+                           too short; keep_by = \"loss\" needs none";
+            return Err(Error::Data { place: "the recordings".into(), message: message.into() });
+        }
+        Ok(labels)
     }
 
     /// Writes `split.csv`: recording, line of its log, side, cameras, steering.

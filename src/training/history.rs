@@ -22,6 +22,10 @@ pub struct EpochRecord {
     pub val_mae_deg: Option<f64>,
     /// `val_center_mse` ÷ the mean squared label of the same images: 1 is as good as always predicting zero.
     pub relative_to_zero: Option<f64>,
+    /// Mean squared error of the validation images of the centre camera against the steering that follows the driven path, where
+    /// the recipe keeps by that.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub val_path_mse: Option<f64>,
     /// Learning rate of the last update.
     pub learning_rate: f64,
     /// Number of training images.
@@ -75,6 +79,7 @@ mod tests {
             val_center_mse: None,
             val_mae_deg: None,
             relative_to_zero: None,
+            val_path_mse: None,
             learning_rate: 1e-3,
             images: 7,
             train_seconds: 1.5,

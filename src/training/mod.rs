@@ -13,6 +13,7 @@
 //! | `checksums.txt` | SHA-256 of the text files above, as `sha256sum` writes it; they are checked when they are read |
 //! | `.lock` | there while a process works on the run; the system releases it with the process |
 //! | `report.html` | the run in pictures; see [`crate::report::pages::run`] |
+//! | `replay.json` | what the model is worth on its recordings: errors, and drives on their pictures |
 //! | `result.json` | what `train --json` prints; its presence says that the run is finished |
 
 mod averaged;

@@ -10,7 +10,7 @@ use steersman_kernels::{Backend, Isa};
 
 use super::averaged;
 use super::checkpoint::{Progress, State};
-use super::data::{Data, images};
+use super::data::{Data, Sources, images};
 use super::history::EpochRecord;
 use super::profile::{Profile, ProfileReport};
 use super::run_folder::{RunFolder, RunInfo, RunLock};
@@ -28,7 +28,7 @@ use crate::files::atomic_file;
 use crate::files::limits::keep_elsewhere;
 use crate::model_file::{Model, TrainingRecord, weights_hash};
 use crate::observer::{Observer, StopSignal};
-use crate::recipe::{Keep, Recipe};
+use crate::recipe::{Keep, KeepBy, Recipe};
 
 /// Maximum of images of one row: three cameras, each mirrored. A batch of whole rows has at least one row.
 const MAX_ROW_IMAGES: usize = 6;
@@ -38,6 +38,10 @@ const MAX_ROW_IMAGES: usize = 6;
 pub struct TrainRequest {
     /// Udacity logs or donkeycar tubs.
     pub recordings: Vec<PathBuf>,
+    /// Recordings that are the validation side, whole; without any, a share of the rows of the others is.
+    pub validate: Vec<PathBuf>,
+    /// Views that a model met, recordings too, which are always trained on.
+    pub also: Vec<PathBuf>,
     /// What the user says about the recordings.
     pub said: Description,
     /// The experiment.
@@ -141,11 +145,13 @@ pub fn train(
     stop: &StopSignal,
 ) -> Result<TrainResult> {
     let started = Instant::now();
-    let TrainRequest { recordings, said, recipe, out, seed, cache_mib, from, algorithm, profile } = request;
+    let TrainRequest { recordings, validate, also, said, recipe, out, seed, cache_mib, from, algorithm, profile } =
+        request;
     let profile = profile.then(Profile::start);
     let algorithm = algorithm.unwrap_or_else(ConvAlgorithm::of_environment);
     let start = from.as_ref().map(|from| Start::load(&from.model, from, &recipe, seed)).transpose()?;
-    let data = Data::prepare(&recordings, &said, &recipe, seed, cache_mib)?;
+    let sources = Sources { paths: &recordings, validate: &validate, also: &also };
+    let data = Data::prepare(sources, &said, &recipe, seed, cache_mib)?;
     let mut trained_on_held_out = held_out_tracks(&recordings)?;
     for track in start.iter().flat_map(|start| &start.trained_on_held_out) {
         if !trained_on_held_out.contains(track) {
@@ -161,6 +167,8 @@ pub fn train(
         algorithm: (algorithm != ConvAlgorithm::Auto).then(|| algorithm.to_string()),
         seed,
         recordings: recordings.iter().map(absolute).collect::<Result<_>>()?,
+        validate: validate.iter().map(absolute).collect::<Result<_>>()?,
+        also: also.iter().map(absolute).collect::<Result<_>>()?,
         cache_mib,
         said,
         rows_hash: data.rows_hash(),
@@ -220,14 +228,18 @@ pub fn resume_with(
     }
     let mut info = folder.info()?;
     if let Some(moved) = moved {
-        if moved.len() != info.recordings.len() {
-            let (found, needed) = (moved.len(), info.recordings.len());
+        let training = info.recordings.len();
+        let (driven, needed) = (training + info.validate.len(), training + info.validate.len() + info.also.len());
+        if moved.len() != needed {
+            let found = moved.len();
             return Err(Error::Usage(format!(
                 "the run has {needed} recordings, --recordings names {found}: name all, in their order"
             )));
         }
         let absolute = |path: &PathBuf| std::path::absolute(path).map_err(Error::io(path));
-        info.recordings = moved.iter().map(absolute).collect::<Result<_>>()?;
+        info.recordings = moved[..training].iter().map(absolute).collect::<Result<_>>()?;
+        info.validate = moved[training..driven].iter().map(absolute).collect::<Result<_>>()?;
+        info.also = moved[driven..].iter().map(absolute).collect::<Result<_>>()?;
     }
     let recipe = folder.recipe()?;
     let isa = Isa::best().name();
@@ -238,11 +250,13 @@ pub fn resume_with(
             info.isa, info.isa
         )))?;
     }
-    if let Some(gone) = info.recordings.iter().find(|path| moved.is_none() && !path.exists()) {
+    if let Some(gone) =
+        info.recordings.iter().chain(&info.validate).chain(&info.also).find(|path| moved.is_none() && !path.exists())
+    {
         let message = "the recording is not there any more; if it was moved, say where it is with --recordings";
         return Err(Error::data(gone, message));
     }
-    let data = Data::prepare(&info.recordings, &info.said, &recipe, info.seed, info.cache_mib)?;
+    let data = Data::of_run(&info, &recipe, info.cache_mib)?;
     if data.rows_hash() != info.rows_hash {
         let message = "the recordings have changed since the run began; it can only go on with the same rows";
         return Err(Error::data(folder.file("run.json"), message));
@@ -309,6 +323,10 @@ impl TrainingRun {
             }
             None => network.initialize(info.seed),
         };
+        let path_labels = match recipe.keep_by {
+            KeepBy::Loss => Vec::new(),
+            KeepBy::Path => data.path_labels()?,
+        };
         let (mut training, validation) = data.into_loaders()?;
         let smoothness = recipe.smoothness.filter(|smoothness| !smoothness.is_off());
         if let Some(smoothness) = &smoothness {
@@ -330,7 +348,9 @@ impl TrainingRun {
         Ok(TrainingRun {
             plan: TrainingPlan::new(&network, plan_capacity),
             smoothness,
-            validation: validation.map(|loader| Validation::new(loader, &network, capacity, recipe.full_lock_deg)),
+            validation: validation.map(|loader| {
+                Validation::new(loader, &network, capacity, recipe.full_lock_deg).with_path_labels(path_labels)
+            }),
             state: State {
                 average: recipe.averaging.map(|spec| WeightAverage::new(spec, &parameters, network.isa())),
                 parameters,
@@ -526,6 +546,7 @@ impl TrainingRun {
             val_center_mse: validation.map(|v| v.center_mse),
             val_mae_deg: validation.map(|v| v.mae_deg),
             relative_to_zero: validation.and_then(|v| v.relative_to_zero),
+            val_path_mse: validation.and_then(|v| v.path_mse),
             learning_rate: progress.learning_rate,
             images: progress.images,
             train_seconds: progress.train_seconds,
@@ -536,12 +557,16 @@ impl TrainingRun {
         (progress.next_batch, progress.loss_sum, progress.images, progress.train_seconds) = (0, 0.0, 0, 0.0);
 
         // Without a validation side, or with `keep = "last"`, the latest weights count as the best.
-        let better = match (record.val_mse, progress.best_val_mse) {
+        let measure = match self.recipe.keep_by {
+            KeepBy::Loss => record.val_mse,
+            KeepBy::Path => record.val_path_mse,
+        };
+        let better = match (measure, progress.best_val_mse) {
             (Some(now), Some(before)) => now < before || self.recipe.keep == Keep::Last,
             _ => true,
         };
         if better {
-            progress.best_val_mse = record.val_mse;
+            progress.best_val_mse = measure;
             progress.best_epoch = record.epoch;
             let mut best = self.state.best.take().unwrap_or_else(|| self.state.parameters.clone());
             best.clone_from(self.state.model());
@@ -550,6 +575,8 @@ impl TrainingRun {
         let progress = &mut self.state.progress;
         if let Some(now) = record.val_mse {
             self.recipe.schedule.end_epoch(now, &mut progress.plateau);
+        }
+        if let Some(now) = measure {
             let min_delta = self.recipe.early_stopping.map_or(0.0, |stopping| stopping.min_delta);
             if progress.improved_val_mse.is_none_or(|before| now < before - min_delta) {
                 progress.improved_val_mse = Some(now);

@@ -14,6 +14,7 @@ use crate::files::lock::{LOCK_NAME, Lock};
 use crate::files::{checksums, unfinished};
 use crate::model_file::Transfer;
 use crate::recipe::Recipe;
+use crate::replay::RecordingVerdict;
 
 /// The folder of a run, and the names of what is in it.
 #[derive(Clone, Debug)]
@@ -42,6 +43,12 @@ pub(crate) struct RunInfo {
     pub seed: u64,
     /// Absolute paths of the recordings.
     pub recordings: Vec<PathBuf>,
+    /// Absolute paths of those that are the validation side; without any, a share of the rows of the others is.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub validate: Vec<PathBuf>,
+    /// Absolute paths of views that a model met, which are always trained on.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub also: Vec<PathBuf>,
     /// Memory for decoded images, in MiB.
     pub cache_mib: usize,
     /// What the user said about the recordings.
@@ -76,6 +83,8 @@ impl RunInfo {
 impl RunFolder {
     /// Name of the file in which the main job notes what follows on the training. It may be there before a run begins.
     pub const JOB_NOTE: &str = "main-job.json";
+    /// Name of the file that says what the model is worth on its recordings.
+    pub const REPLAY: &str = "replay.json";
 
     /// Checks that a new run can begin in `path`: it must not exist or be empty.
     ///
@@ -225,6 +234,15 @@ impl RunFolder {
         let path = self.file(name);
         let text = serde_json::to_string_pretty(value).map_err(|e| Error::data(&path, e.to_string()))?;
         checksums::write(&self.path, name, (text + "\n").as_bytes())
+    }
+
+    /// What the model is worth on its recordings, where that was measured.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Io`] and [`Error::Data`].
+    pub fn replay(&self) -> Result<Option<RecordingVerdict>> {
+        if self.file(Self::REPLAY).is_file() { self.read_json(Self::REPLAY).map(Some) } else { Ok(None) }
     }
 
     fn read_json<T: DeserializeOwned>(&self, name: &str) -> Result<T> {

@@ -21,6 +21,8 @@ pub(super) struct ValidationResult {
     pub mae_deg: f64,
     /// `center_mse` ÷ mean squared label; absent if all labels are zero.
     pub relative_to_zero: Option<f64>,
+    /// Mean squared error against the steering that follows the driven path; absent if it was not asked for, or nothing has one.
+    pub path_mse: Option<f64>,
 }
 
 /// The validation side with its buffers.
@@ -31,6 +33,8 @@ pub(super) struct Validation {
     batches: [Batch; 2],
     predictions: Vec<f32>,
     full_lock_deg: f64,
+    /// For each row of each recording, as far as asked for.
+    path_labels: Vec<Vec<Option<f32>>>,
 }
 
 impl Validation {
@@ -42,7 +46,13 @@ impl Validation {
             predictions: vec![0.0; capacity],
             loader,
             full_lock_deg,
+            path_labels: Vec::new(),
         }
+    }
+
+    /// The same, which also compares with `path_labels`, those of each row of each recording.
+    pub fn with_path_labels(self, path_labels: Vec<Vec<Option<f32>>>) -> Validation {
+        Validation { path_labels, ..self }
     }
 
     /// Measures from now on: adds the times to `loading` and `evaluation`.
@@ -72,9 +82,10 @@ impl Validation {
     ///
     /// [`Error::Io`](crate::Error::Io) if the image cache fails.
     pub fn run(&mut self, network: &Network, parameters: &Parameters) -> Result<Option<ValidationResult>> {
-        let Validation { loader, plan, batches: [current, next], predictions, full_lock_deg } = self;
+        let Validation { loader, plan, batches: [current, next], predictions, full_lock_deg, path_labels } = self;
         let (mut squares, mut images) = (0.0, 0usize);
         let (mut center_squares, mut center_absolute, mut label_squares, mut center_images) = (0.0, 0.0, 0.0, 0usize);
+        let (mut path_squares, mut path_images) = (0.0, 0usize);
         loader.fill(0, current)?;
         for batch in 0..loader.batches() {
             // The next batch is loaded while the network evaluates this one.
@@ -100,6 +111,11 @@ impl Validation {
                     center_absolute += error.abs();
                     label_squares += label * label;
                     center_images += 1;
+                    let of_recording = path_labels.get(usize::from(sample.recording));
+                    if let Some(Some(path_label)) = of_recording.and_then(|labels| labels.get(sample.row as usize)) {
+                        path_squares += (f64::from(*prediction) - f64::from(*path_label)).powi(2);
+                        path_images += 1;
+                    }
                 }
             }
             std::mem::swap(current, next);
@@ -113,6 +129,7 @@ impl Validation {
             center_mse: center_squares / center,
             mae_deg: center_absolute / center * *full_lock_deg,
             relative_to_zero: (label_squares > 0.0).then(|| center_squares / label_squares),
+            path_mse: (path_images > 0).then(|| path_squares / path_images as f64),
         }))
     }
 }

@@ -20,6 +20,8 @@ pub(crate) struct Telemetry<'a> {
     pub cte_m: Option<f64>,
     /// Simulated time, s. Only a client that waits for each reply sends it.
     pub time_s: Option<f64>,
+    /// Whether a person steers, and the picture goes on. Udacity's simulator sends no picture then.
+    pub by_user: bool,
     /// A JPEG image in base64.
     pub image: Option<Cow<'a, str>>,
     /// The decimal mark, if a number showed it.
@@ -50,19 +52,22 @@ pub(super) struct Fields<'a> {
     cte: Number,
     #[serde(rename = "steersman_lockstep_s", deserialize_with = "number_or_nothing")]
     lockstep_s: Number,
+    #[serde(rename = "steersman_mode", deserialize_with = "is_user")]
+    by_user: bool,
     #[serde(borrow)]
     image: Option<Text<'a>>,
 }
 
 impl<'a> From<Fields<'a>> for Telemetry<'a> {
     fn from(fields: Fields<'a>) -> Telemetry<'a> {
-        let Fields { steering_angle, throttle, speed, cte, lockstep_s, image } = fields;
+        let Fields { steering_angle, throttle, speed, cte, lockstep_s, by_user, image } = fields;
         Telemetry {
             steering_deg: steering_angle.value,
             throttle: throttle.value,
             speed_mph: speed.value,
             cte_m: cte.value,
             time_s: lockstep_s.value,
+            by_user,
             image: image.map(|Text(image)| image),
             mark: speed.mark.or(steering_angle.mark).or(throttle.mark),
         }
@@ -83,6 +88,17 @@ fn number_or_nothing<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Numbe
     })
 }
 
+/// Whether the text is `user`. Anything else is no error, because simulators do not have this field.
+fn is_user<'de, D: Deserializer<'de>>(deserializer: D) -> Result<bool, D::Error> {
+    #[derive(Deserialize)]
+    #[serde(untagged)]
+    enum Anything {
+        Text(String),
+        Other(IgnoredAny),
+    }
+    Ok(matches!(Anything::deserialize(deserializer)?, Anything::Text(text) if text == "user"))
+}
+
 /// The content of a telemetry that a client writes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Readings<'a> {
@@ -96,13 +112,15 @@ pub(crate) struct Readings<'a> {
     pub cte_m: Option<f64>,
     /// Simulated time, s, if the client waits for each reply.
     pub time_s: Option<f64>,
+    /// Whether a person steers.
+    pub by_user: bool,
     /// A JPEG image in base64.
     pub image: &'a str,
 }
 
 /// Appends a `telemetry` event as the simulator writes it: all numbers as strings with four decimals, in the order and
 /// language of the original. The original has no field for the simulated time. `steersman_lockstep_s`, a name that no other
-/// simulator sends, stands last, in the shortest decimal form with a point.
+/// simulator sends, stands behind, in the shortest decimal form with a point; then `steersman_mode` if a person steers.
 pub(crate) fn print_telemetry(out: &mut String, readings: &Readings, mark: DecimalMark) {
     out.push_str("42[\"telemetry\",{");
     let mut field = |name: &str, value: f64| {
@@ -121,6 +139,9 @@ pub(crate) fn print_telemetry(out: &mut String, readings: &Readings, mark: Decim
     push(out, format_args!("\"image\":\"{}\"", readings.image));
     if let Some(time_s) = readings.time_s {
         push(out, format_args!(",\"steersman_lockstep_s\":\"{time_s}\""));
+    }
+    if readings.by_user {
+        out.push_str(",\"steersman_mode\":\"user\"");
     }
     out.push_str("}]");
 }

@@ -188,8 +188,15 @@ fn the_handshake_of_ordinary_clients() {
 fn telemetry_is_printed_as_the_simulator_does() {
     let mut out = String::new();
     let image = "/9j/4AAQSkZJRg==";
-    let mut readings =
-        Readings { steering_deg: -0.000_01, throttle: 0.0, speed_mph: 0.438, cte_m: None, time_s: None, image };
+    let mut readings = Readings {
+        steering_deg: -0.000_01,
+        throttle: 0.0,
+        speed_mph: 0.438,
+        cte_m: None,
+        time_s: None,
+        by_user: false,
+        image,
+    };
     print_telemetry(&mut out, &readings, DecimalMark::DOT);
     assert_eq!(out, TELEMETRY);
     (readings.steering_deg, readings.time_s) = (-12.5, Some(0.1 + 0.2));

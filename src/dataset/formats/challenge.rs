@@ -99,6 +99,7 @@ fn read(store: &Store, path: &Path, rows: &mut Rows) -> Result<()> {
                     camera if camera.starts_with("left") => sides[0].push((time_ms, file)),
                     camera if camera.starts_with("right") => sides[1].push((time_ms, file)),
                     _ => centre.push(Entry {
+                        taken_over: false,
                         line: 0,
                         images: [Some(file), None, None],
                         steering,
@@ -155,6 +156,7 @@ fn read_frames(store: &Store, path: &Path, rows: &mut Rows) -> Result<()> {
                 let is_png = places.iter().any(|place| store.is_file(&place.join(&png)));
                 let time_ms = time_ms(&id);
                 rows.push(Entry {
+                    taken_over: false,
                     line: number,
                     images: [Some(if is_png { png } else { format!("{id}.jpg") }), None, None],
                     steering,

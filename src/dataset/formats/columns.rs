@@ -12,18 +12,25 @@ pub(crate) struct Columns {
     pub steering: usize,
     /// Throttle, brake, speed.
     pub numbers: [Option<usize>; 3],
+    /// Who steered: `user` or `pilot`.
+    pub mode: Option<usize>,
     /// Columns that the header names.
     pub count: usize,
 }
 
 impl Columns {
     /// The usual order.
-    pub const USUAL: Columns =
-        Columns { images: [Some(0), Some(1), Some(2)], steering: 3, numbers: [Some(4), Some(5), Some(6)], count: 7 };
+    pub const USUAL: Columns = Columns {
+        images: [Some(0), Some(1), Some(2)],
+        steering: 3,
+        numbers: [Some(4), Some(5), Some(6)],
+        mode: None,
+        count: 7,
+    };
 
     /// Whether the first seven columns are the usual ones.
     pub fn are_usual(&self) -> bool {
-        Columns { count: 7, ..self.clone() } == Columns::USUAL
+        Columns { count: 7, mode: None, ..self.clone() } == Columns::USUAL
     }
 }
 
@@ -123,6 +130,7 @@ pub(crate) fn find(header: &[&str], said: &BTreeMap<Column, ColumnRef>) -> Resul
         images: [Some(center), side(left), side(right)],
         steering,
         numbers: [throttle, brake, speed],
+        mode: names.iter().position(|name| ["mode", "user/mode"].contains(&name.as_str())),
         count: header.len(),
     }))
 }
@@ -142,7 +150,7 @@ pub(crate) fn without_header(said: &BTreeMap<Column, ColumnRef>) -> Result<Optio
     let [center, left, right, steering, throttle, brake, speed] = places;
     let count = places.iter().flatten().max().map_or(7, |last| last + 1).max(7);
     let steering = steering.unwrap_or(3);
-    Ok(Some(Columns { images: [center, left, right], steering, numbers: [throttle, brake, speed], count }))
+    Ok(Some(Columns { images: [center, left, right], steering, numbers: [throttle, brake, speed], mode: None, count }))
 }
 
 #[cfg(test)]
@@ -162,6 +170,8 @@ mod tests {
         assert!(found.are_usual());
         let found = columns("center,left,right,steering,throttle,brake,speed,lap", "").unwrap().unwrap();
         assert!(found.are_usual() && found.count == 8);
+        let found = columns("center,left,right,steering,throttle,brake,speed,mode", "").unwrap().unwrap();
+        assert!(found.are_usual() && (found.count, found.mode) == (8, Some(7)));
     }
 
     #[test]

@@ -125,6 +125,7 @@ fn read(store: &Store, folder: &Path, rows: &mut Rows) -> Result<()> {
         let time_ms = super::udacity::time_of(&name);
         match style.label(&name) {
             Some(steering) => rows.push(Entry {
+                taken_over: false,
                 line,
                 images: [Some(name), None, None],
                 steering,

@@ -110,6 +110,7 @@ fn read(store: &Store, path: &Path, rows: &mut Rows) -> Result<()> {
     for (line, Parsed { file, angle, time_ms }) in parsed {
         let source = split_path(&file).0.to_owned();
         rows.push(Entry {
+            taken_over: false,
             line,
             images: [Some(file), None, None],
             steering: angle,

@@ -125,6 +125,7 @@ pub(super) fn push(record: Record, line: u32, labels: Labels, counts: &mut Count
     // Times beyond the year 9999 are no times.
     let time_ms = record.time_ms.as_ref().and_then(|time| time.as_i64().or(time.as_f64().map(|time| time as i64)));
     rows.push(Entry {
+        taken_over: false,
         line,
         images: [Some(image), None, None],
         steering,

@@ -242,7 +242,8 @@ fn by_columns(fields: &[&str], columns: &Columns, decimal_commas: bool, line: u3
         number(brake, "brake")?,
         number(speed, "speed")?,
     ];
-    Ok(entry(line, images, values))
+    let by_user = columns.mode.map(field).transpose()?.is_some_and(|mode| mode.trim().eq_ignore_ascii_case("user"));
+    Ok(Entry { taken_over: by_user, ..entry(line, images, values) })
 }
 
 /// A row in the usual order: three images, then steering, throttle, brake and speed.
@@ -316,6 +317,7 @@ fn number(field: &str, decimal_comma: bool, name: &str) -> Result<f64, Fault> {
 fn entry(line: u32, images: [Option<String>; 3], values: [f64; 4]) -> Entry {
     let [steering, throttle, brake, speed_mph] = values;
     Entry {
+        taken_over: false,
         line,
         images,
         steering,

@@ -6,6 +6,9 @@ use std::io::{self, Write};
 /// The first line of a log with a header.
 pub const HEADER: &str = "center,left,right,steering,throttle,brake,speed\n";
 
+/// The first line of a log that says in a last column who steered: `user` or `pilot`.
+pub const HEADER_WITH_MODE: &str = "center,left,right,steering,throttle,brake,speed,mode\n";
+
 /// Milliseconds from 1970-01-01 to 10000-01-01, where names end.
 const YEAR_10000_MS: u64 = 253_402_300_800_000;
 

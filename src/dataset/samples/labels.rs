@@ -131,6 +131,27 @@ impl Targets {
         targets
     }
 
+    /// The same with `views` behind them, single pictures each with the steering that leads back to a path: that is the label, whatever
+    /// the recipe says, and the car is taken to go on as it is steered.
+    pub fn with_views(mut self, views: &[Recording]) -> Targets {
+        let geometry = self.recordings.iter().any(|recording| recording.geometry.is_some());
+        for recording in views {
+            let car = &recording.geometry;
+            let driven = DrivenSessions::of(recording, car.clone());
+            let look_ahead = LabelSpec::default().look_ahead(car);
+            let speeds_mps = driven.sessions.iter().flat_map(|session| &session.speed_mps);
+            let aims = speeds_mps.zip(&recording.rows).map(|(&speed_mps, row)| {
+                let look_ahead_m = look_ahead.distance_m(speed_mps);
+                let there = Pose::default().moved(look_ahead_m, car.curvature(f64::from(row.steering)));
+                let to = Pose::default().offset_to(there);
+                Aim { right_m: to.right_m as f32, ahead_m: to.ahead_m as f32, look_ahead_m: look_ahead_m as f32 }
+            });
+            let geometry = geometry.then(|| (car.clone(), aims.collect()));
+            self.recordings.push(OfRecording { labels: steering(recording), geometry });
+        }
+        self
+    }
+
     /// The recorded steering of `recordings`, for samples that need no geometry.
     pub fn wheel(recordings: &[Recording]) -> Targets {
         Targets::of(recordings, &LabelSpec::default(), &SampleSpec::default(), &Augmentation::default())
@@ -274,6 +295,19 @@ mod tests {
 
     fn path() -> LabelSpec {
         LabelSpec { kind: LabelKind::Path, ..LabelSpec::default() }
+    }
+
+    #[test]
+    fn views_keep_their_labels_and_lead_back_from_beside() {
+        let driven = [recording_of(&[0.2; 40], 100)];
+        let views = [recording_of(&[0.3, -0.4], 200)];
+        let targets = Targets::of(&driven, &path(), &geometric(), &Augmentation::default()).with_views(&views);
+        let view = |row| Item::new(1, row, [View::Centre]);
+        assert_eq!([0, 1].map(|row| targets.label(view(row))), [Some(0.3), Some(-0.4)]);
+        // Further to the right it steers more to the left, from wherever it was.
+        let right = Offset { right_m: 0.5, ..Offset::default() };
+        assert!([0, 1].iter().all(|&row| targets.beside(view(row), right) < targets.label(view(row)).unwrap() - 0.05));
+        assert_eq!(Targets::wheel(&driven).with_views(&views).label(view(1)), Some(-0.4));
     }
 
     #[test]

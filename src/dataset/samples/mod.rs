@@ -8,6 +8,8 @@ pub mod loader;
 mod pairs;
 mod spec;
 pub mod split;
+pub mod takeover;
+pub mod whole;
 
 pub use balance::Balance;
 pub use labels::{LabelKind, LabelSpec, Targets};

@@ -93,7 +93,7 @@ pub enum Group {
 }
 
 /// The `[samples]` table of a recipe.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SampleSpec {
     /// Steering added to the label of the left camera and taken from the label of the right one, in the unit of the
@@ -114,6 +114,29 @@ pub struct SampleSpec {
     pub validation_side_cameras: bool,
     /// Validate on the mirror of each image as well.
     pub validation_flips: bool,
+    /// How often each training row counts in which a person took the wheel from a model that drove; the part behind the point is
+    /// the share of such rows that count once more.
+    #[serde(skip_serializing_if = "is_one")]
+    pub takeover_weight: f64,
+}
+
+impl Default for SampleSpec {
+    fn default() -> Self {
+        Self {
+            side_cameras: None,
+            flip: Flip::default(),
+            mirror: Mirror::default(),
+            min_throttle: None,
+            group: Group::default(),
+            validation_side_cameras: false,
+            validation_flips: false,
+            takeover_weight: 1.0,
+        }
+    }
+}
+
+fn is_one(weight: &f64) -> bool {
+    *weight == 1.0
 }
 
 impl SampleSpec {
@@ -127,6 +150,9 @@ impl SampleSpec {
         }
         if self.min_throttle.is_some_and(|x| !x.is_finite()) {
             return Err(Error::Usage("[samples] min_throttle: must be a finite number".into()));
+        }
+        if !(0.0..=100.0).contains(&self.takeover_weight) {
+            return Err(Error::Usage("[samples] takeover_weight: must be 0 to 100".into()));
         }
         Ok(())
     }

@@ -84,6 +84,8 @@ impl SplitSpec {
 pub struct Split {
     /// How it was made.
     pub spec: SplitSpec,
+    /// Whether the sides are whole recordings instead; see [`split_whole`](super::whole::split_whole).
+    pub whole: bool,
     /// Training rows.
     pub training: Vec<Item>,
     /// Validation rows.
@@ -120,6 +122,7 @@ pub fn split(
     }
     let mut split = Split {
         spec: spec.clone(),
+        whole: false,
         training: Vec::new(),
         validation: Vec::new(),
         guard_rows: 0,
@@ -172,7 +175,7 @@ impl Split {
         let images = |side: &[Item]| side.iter().map(|item| item.cameras().count()).sum::<usize>();
         let mut lines = vec![format!(
             "split {}: {} training rows ({} images), {} validation rows ({} images)",
-            self.spec.mode.name(),
+            if self.whole { "by recording" } else { self.spec.mode.name() },
             self.training.len(),
             images(&self.training),
             self.validation.len(),
@@ -190,6 +193,24 @@ impl Split {
         }
         lines.extend(self.notices.iter().cloned());
         lines.join("\n")
+    }
+
+    /// Adds all rows of `recordings` from number `first` on to the training side, the centre camera alone: views that a model met,
+    /// each with the steering that leads back.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] for too many recordings.
+    pub fn train_on(&mut self, recordings: &[Recording], first: usize) -> Result<()> {
+        if recordings.len() > usize::from(u16::MAX) {
+            return Err(Error::Usage("more than 65,535 recordings".into()));
+        }
+        let views: Vec<Item> =
+            all_rows(recordings).into_iter().filter(|item| usize::from(item.recording) >= first).collect();
+        if !views.is_empty() {
+            self.notices.push(format!("{} views that a model met are trained on as well", views.len()));
+        }
+        self.training.extend(views);
+        Ok(())
     }
 
     fn require_both_sides(&self) -> Result<()> {
@@ -421,11 +442,11 @@ fn rows_of(recording: u16, rows: Range<usize>) -> impl Iterator<Item = Item> {
     rows.map(move |row| Item::new(recording, row as u32, [View::Centre]))
 }
 
-fn all_rows(recordings: &[Recording]) -> Vec<Item> {
+pub(super) fn all_rows(recordings: &[Recording]) -> Vec<Item> {
     recordings.iter().enumerate().flat_map(|(i, recording)| rows_of(i as u16, 0..recording.rows.len())).collect()
 }
 
-fn drop_low_throttle(items: &mut Vec<Item>, recordings: &[Recording], samples: &SampleSpec) -> usize {
+pub(super) fn drop_low_throttle(items: &mut Vec<Item>, recordings: &[Recording], samples: &SampleSpec) -> usize {
     let before = items.len();
     if let Some(min) = samples.min_throttle {
         // Where the throttle was not recorded it is NaN, and the row stays.
@@ -437,13 +458,13 @@ fn drop_low_throttle(items: &mut Vec<Item>, recordings: &[Recording], samples: &
     before - items.len()
 }
 
-fn drop_unlabelled(items: &mut Vec<Item>, targets: &Targets) -> usize {
+pub(super) fn drop_unlabelled(items: &mut Vec<Item>, targets: &Targets) -> usize {
     let before = items.len();
     items.retain(|item| targets.label(*item).is_some());
     before - items.len()
 }
 
-fn set_cameras(items: &mut [Item], recordings: &[Recording], sides: bool) {
+pub(super) fn set_cameras(items: &mut [Item], recordings: &[Recording], sides: bool) {
     for item in items {
         let recording = &recordings[usize::from(item.recording)];
         let used = |camera: &View| *camera == View::Centre || (sides && recording.row_has(item.row as usize, *camera));

@@ -5,6 +5,8 @@ use super::chart::NARROW;
 use super::palette::{INK, QUIET_INK, ROAD, ROAD_EDGE, heat_hex};
 use crate::error::{Error, Result};
 use crate::files::new_folder::NewFolder;
+use crate::geometry::{DrivenPath, Offset, Pose};
+use crate::replay::MAX_OFFSET_M;
 use crate::report::charts::svg::{Anchor, Svg};
 use crate::simulator::trial::outcome::Moment;
 use crate::simulator::{DriveResult, DriveSummary, Track};
@@ -69,10 +71,30 @@ pub fn draw(title: &str, track: Option<&Track>, drives: &[Vec<MapPoint>], size: 
     draw_at(title, track, drives, size, darkest_m(drives.iter().flatten().map(|point| point.cte_m)))
 }
 
+/// Draws `drive` along the `path` of a recording, within `size` (width, height) pixels: on the ground where the car is not put back.
+pub fn draw_on_path(title: &str, path: &DrivenPath, drive: &[MapPoint], size: [f64; 2]) -> String {
+    let edge = |right_m: f64| -> Vec<[f64; 2]> {
+        let beside = |pose: &Pose| pose.displaced(Offset { right_m, ..Offset::default() });
+        path.poses().iter().map(beside).map(|pose| [pose.x_m, pose.y_m]).collect()
+    };
+    let (edges, drives) = (vec![edge(MAX_OFFSET_M), edge(-MAX_OFFSET_M)], [drive.to_vec()]);
+    draw_between(title, &edges, &drives, size, darkest_m(drive.iter().map(|point| point.cte_m)))
+}
+
 fn draw_at(title: &str, track: Option<&Track>, drives: &[Vec<MapPoint>], size: [f64; 2], darkest_m: f64) -> String {
+    draw_between(title, &track.map(edges).unwrap_or_default(), drives, size, darkest_m)
+}
+
+/// Draws `drives` and the road between `edges`, two or none.
+fn draw_between(
+    title: &str,
+    edges: &[Vec<[f64; 2]>],
+    drives: &[Vec<MapPoint>],
+    size: [f64; 2],
+    darkest_m: f64,
+) -> String {
     let mut svg = Svg::new(size[0], size[1]);
     svg.text([14.0, 22.0], 15.0, Anchor::Start, "font-weight=\"600\"", title);
-    let edges = track.map(edges).unwrap_or_default();
     let driven = drives.iter().flatten().map(|place| [place.x, place.y]);
     let corners = edges.iter().flatten().copied().chain(driven);
     let within = [16.0, 36.0, size[0] - 16.0, size[1] - 58.0];
@@ -82,7 +104,7 @@ fn draw_at(title: &str, track: Option<&Track>, drives: &[Vec<MapPoint>], size: [
     };
     let place = |point| projection.place(point);
 
-    if let [outer, inner] = &edges[..] {
+    if let [outer, inner] = edges {
         let around: Vec<[f64; 2]> = outer.iter().chain(inner.iter().rev()).map(|p| place(*p)).collect();
         svg.polygon(&around, &format!("fill=\"{ROAD}\""));
         for edge in [outer, inner] {

@@ -386,9 +386,10 @@ fn training(page: &mut Page, recordings: &[Recording], recipe: &Recipe, seed: u6
     let all: Vec<f32> = recordings.iter().flat_map(|r| r.rows.iter().map(|row| row.steering)).collect();
     let before = histogram("Before: labels as recorded", HALF, "rows", &all);
     let (spec, samples, balance) = (&recipe.split, &recipe.samples, &recipe.balance);
-    match crate::dataset::split::split(recordings, &recipe.targets(recordings), spec, samples, balance, seed) {
+    let targets = recipe.targets(recordings);
+    match crate::dataset::split::split(recordings, &targets, spec, samples, balance, seed) {
         Ok(split) => {
-            let view = SplitView::of(recordings, &split, recipe);
+            let view = SplitView::of(recordings, &targets, &split, recipe);
             view.describe(page);
             page.subsection("Balance of the labels");
             let after = histogram("After: labels that training sees", HALF, "images an epoch", &view.training_labels);

@@ -14,6 +14,7 @@ use crate::error::Result;
 use crate::files::atomic_file;
 use crate::metrics::{Metrics, Prediction};
 use crate::pilot::Pilot;
+use crate::replay::{RecordingVerdict, SideVerdict};
 use crate::report::charts::chart::{Axis, Chart, Mark};
 use crate::report::charts::palette::{MODEL_RGB, REFERENCE_RGB};
 use crate::report::charts::steering::histogram;
@@ -55,7 +56,7 @@ pub fn write(path: &Path) -> Result<PathBuf> {
 fn page(folder: &RunFolder, path: &Path) -> Result<String> {
     let (info, recipe, history) = (folder.info()?, folder.recipe()?, folder.history()?);
     let pilot = Pilot::load(&folder.model())?;
-    let data = Data::prepare(&info.recordings, &info.said, &recipe, info.seed, 0)?;
+    let data = Data::of_run(&info, &recipe, 0)?;
     let lead = format!("Recipe {}: {}", recipe.name, recipe.about);
     let mut page = Page::new(&path.display().to_string(), &lead);
     let drives = drives::read(path)?;
@@ -67,6 +68,9 @@ fn page(folder: &RunFolder, path: &Path) -> Result<String> {
         Some(result) => headline(&mut page, &result, drives.is_empty()),
         None => page.advice(&unfinished(history.len(), recipe.epochs, path), Tone::Warning),
     }
+    if let Some(verdict) = folder.replay()? {
+        on_recording(&mut page, &verdict);
+    }
     curves(&mut page, &history);
     let answers = answers(&pilot, &data);
     let predictions: Vec<Prediction> = answers.iter().map(|answer| answer.prediction).collect();
@@ -75,7 +79,7 @@ fn page(folder: &RunFolder, path: &Path) -> Result<String> {
         worst(&mut page, &answers, &data, recipe.full_lock_deg);
     }
     page.section("Data");
-    let view = SplitView::of(data.recordings(), data.split(), &recipe);
+    let view = SplitView::of(data.recordings(), data.targets(), data.split(), &recipe);
     view.describe(&mut page);
     let title = "Labels of an epoch's training images";
     page.drawings(&[histogram(title, HALF, "images", &view.training_labels)]);
@@ -124,6 +128,51 @@ fn headline(page: &mut Page, result: &TrainResult, alone: bool) {
         ["leak".into(), format!("{:.1} %", result.leak_percent)],
     ];
     page.table(&["", ""], &rows.map(Vec::from));
+}
+
+/// What the model is worth on the recordings it was trained on.
+fn on_recording(page: &mut Page, verdict: &RecordingVerdict) {
+    page.subsection("On the recording");
+    page.paragraph(
+        "Errors of single pictures against the recorded wheel and against the steering that follows the driven path; then drives \
+         on the recorded pictures, warped to where the car is, which is put back when it is more than a metre or 15 degrees from \
+         the path.",
+    );
+    let deg = |value: Option<f64>| value.map_or("-".into(), |v| format!("{v:.2}°"));
+    let ratio = |value: Option<f64>| value.map_or("-".into(), |v| format!("{v:.2}"));
+    let row = |side: &SideVerdict| {
+        let mut cells = vec![
+            side.side.clone(),
+            deg(side.wheel_mae_deg),
+            ratio(side.wheel_relative_to_zero),
+            deg(side.path_mae_deg),
+            ratio(side.path_relative_to_zero),
+        ];
+        cells.extend(side.drive.as_ref().map_or([(); 4].map(|()| "-".into()), |drive| {
+            [
+                format!("{:.1} %", drive.autonomy_percent),
+                format!("{:.1}", drive.interventions_per_km),
+                format!("{:.2} m", drive.offset_mean_m),
+                format!("{:.2} m", drive.offset_p95_m),
+            ]
+        }));
+        cells
+    };
+    let headers = [
+        "side",
+        "error of the wheel",
+        "squared ÷ straight wheel's",
+        "error of the path's wheel",
+        "squared ÷ straight wheel's",
+        "autonomy",
+        "put back, a km",
+        "mean distance from path",
+        "95 % below",
+    ];
+    page.table(&headers, &verdict.sides.iter().map(row).collect::<Vec<_>>());
+    for note in &verdict.notes {
+        page.paragraph(note);
+    }
 }
 
 /// The curves over the epochs.

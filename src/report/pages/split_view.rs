@@ -3,7 +3,7 @@
 use super::html::Page;
 use crate::dataset::leak::LeakAudit;
 use crate::dataset::split::{GUARD_MS, Split};
-use crate::dataset::{Flip, Item, Recording};
+use crate::dataset::{Flip, Item, Recording, Targets};
 use crate::recipe::Recipe;
 use crate::report::charts::chart::NARROW;
 use crate::report::charts::palette::{BLUE, INK, ORANGE, PALE, QUIET_INK, VERMILION};
@@ -62,15 +62,15 @@ struct Strip {
 }
 
 impl SplitView {
-    /// What `split` makes of `recordings`.
-    pub fn of(recordings: &[Recording], split: &Split, recipe: &Recipe) -> SplitView {
+    /// What `split` makes of `recordings`, whose labels are `targets`.
+    pub fn of(recordings: &[Recording], targets: &Targets, split: &Split, recipe: &Recipe) -> SplitView {
         let strips = recordings.iter().enumerate().take(MAX_STRIPS);
         SplitView {
             strips: strips.map(|(i, recording)| Strip::of(i, recording, split)).collect(),
             more: recordings.len().saturating_sub(MAX_STRIPS),
             summary: split.summary(),
             audit: LeakAudit::of(split, recordings),
-            training_labels: training_labels(recordings, split, recipe),
+            training_labels: training_labels(targets, split, recipe),
         }
     }
 
@@ -154,7 +154,7 @@ impl Strip {
             let near = |other: &usize| (recording.rows[*other].time_ms - recording.rows[row].time_ms).abs() <= GUARD_MS;
             let before = (session.start..row).rev().take_while(near);
             let after = (row + 1..session.end).take_while(near);
-            before.chain(after).filter(|_| !split.spec.mode.leaks()).for_each(|other| {
+            before.chain(after).filter(|_| !split.spec.mode.leaks() && !split.whole).for_each(|other| {
                 if fates[other] == RowFate::LeftOut {
                     fates[other] = RowFate::Guard;
                 }
@@ -176,8 +176,7 @@ impl Strip {
     }
 }
 
-fn training_labels(recordings: &[Recording], split: &Split, recipe: &Recipe) -> Vec<f32> {
-    let targets = &recipe.targets(recordings);
+fn training_labels(targets: &Targets, split: &Split, recipe: &Recipe) -> Vec<f32> {
     let labels = (split.training.iter())
         .flat_map(|&item| item.cameras().map(move |camera| recipe.samples.label(targets, item, camera)));
     match recipe.samples.flip {
@@ -207,7 +206,7 @@ mod tests {
         let targets = recipe.targets(&recordings);
         let (spec, samples, balance) = (&recipe.split, &recipe.samples, &recipe.balance);
         let split = crate::dataset::split::split(&recordings, &targets, spec, samples, balance, 1).unwrap();
-        let view = SplitView::of(&recordings, &split, &recipe);
+        let view = SplitView::of(&recordings, &targets, &split, &recipe);
         let seconds = |wanted: RowFate| -> f64 {
             view.strips[0].stretches.iter().filter(|s| s.2 == wanted).map(|(from, to, _)| to - from).sum()
         };

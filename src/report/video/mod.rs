@@ -9,6 +9,7 @@ pub mod file;
 pub mod film;
 mod lettering;
 mod mp4;
+pub mod on_recording;
 pub mod onlooker;
 pub mod painter;
 pub mod recording;

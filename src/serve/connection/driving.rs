@@ -10,8 +10,9 @@ use super::{Connection, End};
 use crate::net::connections::Rank;
 use crate::serve::helm::FrameTime;
 use crate::serve::journal::Incident;
-use crate::serve::recording::Queued;
+use crate::serve::recording::{Queued, Recorder};
 use crate::serve::seat::Claim;
+use crate::simulator::car::dynamics::MAX_STEER_DEG;
 use crate::udacity::{ClientPacket, Command, DecimalMark, NumberStyle, Telemetry};
 
 /// Largest height or width of a picture, pixels.
@@ -29,6 +30,9 @@ impl Connection<'_, '_> {
             _ => return self.let_person_drive(arrived),
         };
         self.learn_style(&telemetry);
+        if telemetry.by_user {
+            return self.learn_from_person(&telemetry, arrived);
+        }
         if self.overridden {
             self.overridden = false;
             self.shared.journal.step(format_args!("{}: the model drives again", self.address));
@@ -63,13 +67,7 @@ impl Connection<'_, '_> {
         self.shared.statistics().answered(arrived, Instant::now(), command, speed_mph);
         self.check_throttle(&telemetry, command);
         if let Some(recorder) = &self.shared.recorder {
-            match recorder.push(time, &self.image, command, speed_mph) {
-                Queued::Yes => {}
-                Queued::Dropped => {
-                    self.shared.journal.report(Incident::RecordingLags, format_args!("a frame could not be recorded"));
-                }
-                Queued::Failed => self.shared.recording_failed.store(true, Ordering::Relaxed),
-            }
+            self.record(recorder, (time, command, speed_mph), false);
         }
         Ok(())
     }
@@ -104,6 +102,36 @@ impl Connection<'_, '_> {
                 self.shared.journal.report(Incident::DecimalMark, text);
             }
             NumberStyle::Strings(_) => {}
+        }
+    }
+
+    /// A person steers, and the picture goes on: it is recorded with that steering.
+    fn learn_from_person(&mut self, telemetry: &Telemetry, arrived: Instant) -> Result<(), End> {
+        let held = self.shared.seat.is_held_by(self.peer.id, arrived);
+        if let (Some(recorder), Some(image), Some(steering_deg), Some(speed_mph), true) =
+            (&self.shared.recorder, &telemetry.image, telemetry.steering_deg, telemetry.speed_mph, held)
+        {
+            // The model need not answer; but a picture that it could not use is not recorded.
+            if let Err(text) = self.look(image) {
+                self.fault(Incident::UnreadableImage, format_args!("{text}"))?;
+                return self.let_person_drive(arrived);
+            }
+            let time = telemetry.time_s.map_or(FrameTime::Arrival(arrived), FrameTime::Simulated);
+            let steering = (steering_deg / MAX_STEER_DEG).clamp(-1.0, 1.0) as f32;
+            let command = Command { steering, throttle: telemetry.throttle.unwrap_or(0.0).clamp(0.0, 1.0) as f32 };
+            self.record(recorder, (time, command, speed_mph), true);
+        }
+        self.let_person_drive(arrived)
+    }
+
+    /// Records the frame at hand.
+    fn record(&self, recorder: &Recorder, (time, command, speed_mph): (FrameTime, Command, f64), by_user: bool) {
+        match recorder.push(time, &self.image, command, speed_mph, by_user) {
+            Queued::Yes => {}
+            Queued::Dropped => {
+                self.shared.journal.report(Incident::RecordingLags, format_args!("a frame could not be recorded"));
+            }
+            Queued::Failed => self.shared.recording_failed.store(true, Ordering::Relaxed),
         }
     }
 
