@@ -185,6 +185,9 @@ fn dagger_on_the_recording_trains_on_what_the_model_met_and_never_on_the_validat
     let labels: Vec<f64> =
         log.lines().skip(1).map(|line| line.split(',').nth(3).unwrap().trim().parse().unwrap()).collect();
     assert_eq!(labels.len(), met.len());
+    // The views were seen by the camera of the recording, whatever the format says.
+    let said = fs::read_to_string(dir.join("run/dagger/round-1/steersman.toml")).unwrap();
+    assert!(said.contains("pitch_deg = 9.5") && said.contains("unit = \"lock\""), "{said}");
     assert!(labels.iter().any(|label| *label > 0.02) && labels.iter().any(|label| *label < -0.02), "{labels:?}");
 
     // A folder that a round needs is taken: said before anything is trained.

@@ -176,7 +176,7 @@ pub fn main() -> ExitCode {
 /// Prints what clap has to say: help, the version, or what is wrong with the arguments, which may be names of foreign files.
 fn wrong_arguments(error: &clap::Error) -> ExitCode {
     let text = error.render().to_string();
-    let hint = recipe_entry(error, std::env::args().collect());
+    let hint = recipe_entry(error, std::env::args_os().map(|arg| arg.to_string_lossy().into_owned()).collect());
     if escaped_lines(&text) == text && hint.is_none() {
         error.exit();
     }

@@ -112,7 +112,8 @@ impl TrainingDisplay {
         let rate = Some(rate).filter(|rate| *rate > 0.0).or(self.last_rate);
         let epochs_left = (epochs - epoch) as usize;
         let validations_s = (epochs_left + 1) as f64 * self.validation_s;
-        let left = rate.map(|rate| duration((of - images + epochs_left * of) as f64 / rate + validations_s));
+        let left =
+            rate.map(|rate| duration((of.saturating_sub(images) + epochs_left * of) as f64 / rate + validations_s));
         let left = left.map_or(String::new(), |left| format!(", {left} left"));
         let rate = rate.map_or(String::new(), |rate| format!(", {rate:.0} images/s"));
         match &self.bar {

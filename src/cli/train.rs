@@ -178,10 +178,11 @@ pub fn run(args: TrainArgs) -> Result<()> {
             if !held_out.is_empty() {
                 eprintln!("note: {}", trained_on_held_out(&held_out));
             }
+            let validate = args.reading.expand(args.validate)?;
             let (out, claimed) = out_or_next(args.out, &recipe.name)?;
             let request = TrainRequest {
                 recordings,
-                validate: args.reading.expand(args.validate)?,
+                validate,
                 also: Vec::new(),
                 said: args.reading.said(),
                 recipe,
@@ -192,11 +193,10 @@ pub fn run(args: TrainArgs) -> Result<()> {
                 profile: args.profile,
                 algorithm: args.algorithm,
             };
-            for round in 1..=args.dagger {
-                dagger_on_log::require_free(&out, round)?;
-            }
+            let free = (1..=args.dagger).try_for_each(|round| dagger_on_log::require_free(&out, round));
             let mut observer = |event| display.observe(JobEvent::Training(event));
-            let result = claimed.settle(pool.install(|| training::train(request.clone(), &mut observer, &stop)));
+            let train = || training::train(request.clone(), &mut observer, &stop);
+            let result = claimed.settle(free.and_then(|()| pool.install(train)));
             let result = result.and_then(|result| {
                 if args.dagger > 0 {
                     pool.install(|| judge_or_say(&out));
@@ -223,10 +223,10 @@ pub fn run(args: TrainArgs) -> Result<()> {
     }
     print_training(&result);
     if let Some(verdict) = verdict {
-        print!("{}", verdict::table(&verdict, result.best_epoch));
+        super::print(&verdict::table(&verdict, result.best_epoch))?;
     }
     if args.dagger > 0 {
-        print!("{}", verdict::rounds(&by_round));
+        super::print(&verdict::rounds(&by_round))?;
     }
     Ok(())
 }

@@ -42,13 +42,15 @@ impl DrivenSessions {
 
     /// The same for `stretches` of its rows, each within a session, as if they were sessions of their own.
     pub fn of_stretches(recording: &Recording, geometry: CarGeometry, stretches: &[Range<usize>]) -> DrivenSessions {
-        let known = recording.rows.iter().any(|row| row.speed_mph.is_finite());
+        // A column of zeros beside a moving wheel says no speed either.
+        let known = recording.rows.iter().any(|row| row.speed_mph.is_finite() && row.speed_mph != 0.0);
         let assumed_mps = ASSUMED_WHEELBASES_PER_S * geometry.wheelbase_m;
         let sessions = (stretches.iter())
             .map(|rows| {
                 let of_session = &recording.rows[rows.clone()];
-                // A row without a speed keeps the last one.
-                let mut last_mps = if known { 0.0 } else { assumed_mps };
+                // A row without a speed keeps the last one, the first rows of a session take the first one.
+                let first_mph = of_session.iter().map(|row| row.speed_mph).find(|mph| mph.is_finite() && known);
+                let mut last_mps = first_mph.map_or(assumed_mps, |mph| f64::from(mph).abs() * MPS_PER_MPH);
                 let speed_mps: Vec<f64> = (of_session.iter())
                     .map(|row| {
                         if known && row.speed_mph.is_finite() {

@@ -162,6 +162,25 @@ pub struct GeometryEntry {
     pub full_lock_deg: Option<f64>,
 }
 
+impl From<&CarGeometry> for GeometryEntry {
+    /// Every entry said, and no preset.
+    fn from(geometry: &CarGeometry) -> Self {
+        GeometryEntry {
+            preset: None,
+            image: Some(geometry.image),
+            focal_px: Some(geometry.focal_px),
+            height_m: Some(geometry.height_m),
+            ahead_m: Some(geometry.ahead_m),
+            pitch_deg: Some(geometry.pitch_deg),
+            yaw_deg: Some(geometry.yaw_deg),
+            roll_deg: Some(geometry.roll_deg),
+            side_offsets_m: Some(geometry.side_offsets_m),
+            wheelbase_m: Some(geometry.wheelbase_m),
+            full_lock_deg: Some(geometry.full_lock_deg),
+        }
+    }
+}
+
 impl GeometryEntry {
     /// Whether nothing need be assumed: a preset is named, or every entry is there.
     pub fn is_complete(&self) -> bool {

@@ -10,8 +10,10 @@ use rayon::prelude::*;
 use super::job::{JobEvent, dagger_folder, observed};
 use super::on_recording::{judge_run, sides};
 use crate::dataset::udacity_writer::{HEADER, picture_name, write_row};
+use crate::dataset::{DESCRIPTION_FILE, Description, Unit};
 use crate::error::{Error, Result};
 use crate::files::new_folder::NewFolder;
+use crate::geometry::CarGeometry;
 use crate::observer::{Observer, Progress, StopSignal, Tally};
 use crate::picture::RgbImage;
 use crate::pilot::Pilot;
@@ -58,10 +60,11 @@ pub fn rounds(
         let before = done.last().map_or(folder, |round| &round.folder).to_path_buf();
         let views = folder.join("dagger").join(format!("round-{round}"));
         let what = format!("the model drives on the recording (round {round})");
-        let met = observed(what, observer, stop, |observer| record_views(&before, &views, round, observer, stop))?;
+        let (views, met) =
+            observed(what, observer, stop, |observer| record_views(&before, &views, round, observer, stop))?;
         observer
             .observe(JobEvent::Notice(format!("round {round}: training goes on with {met} views the model met")))?;
-        request.also.push(views);
+        request.also.extend(views);
         request.out = dagger_folder(&before, round - 1, round)?;
         request.from = Some(TransferRequest { model: RunFolder::open(&before)?.model(), freeze: Vec::new() });
         let mut of_training = |event| observer.observe(JobEvent::Training(event));
@@ -91,8 +94,8 @@ struct Met {
 }
 
 /// Lets the model of the run in `path` drive on the training side of its recordings, and writes the views it met to the new folder
-/// `out` as a recording of round `round` (from 1), with the steering towards the driven path. Returns their number. Call it inside a
-/// rayon pool.
+/// `out` as a recording of round `round` (from 1), with the steering towards the driven path. What another camera saw goes to a folder
+/// of its own: `out` with `-camera-2` and so on. Returns the folders and the number of views. Call it inside a rayon pool.
 ///
 /// # Errors
 ///
@@ -104,7 +107,7 @@ pub fn record_views(
     round: u32,
     observer: &mut (dyn Observer<Progress> + Send),
     stop: &StopSignal,
-) -> Result<usize> {
+) -> Result<(Vec<PathBuf>, usize)> {
     let folder = RunFolder::open(path)?;
     let (info, recipe) = (folder.info()?, folder.recipe()?);
     let pilot = Pilot::load(&folder.model())?;
@@ -138,27 +141,54 @@ pub fn record_views(
             let mut pilot = pilot.clone();
             Ok(move |picture: &RgbImage| pilot.steer(picture.view()))
         };
-        replay(log, &ReplayOptions::usual(&log.geometry), new_driver, &seen).map(drop)
+        let look_ahead = recipe.labels.look_ahead(&log.geometry);
+        replay(log, &ReplayOptions { latency_ms: 0.0, look_ahead }, new_driver, &seen).map(drop)
     })?;
     let mut met = met.into_inner().map_err(|_| Error::Fault("a drive has panicked".into()))?;
     met.sort_by_key(|view| view.place);
-    let new = NewFolder::create(out)?;
-    write(&met, round, new.unfinished()).map_err(|error| new.explain(error))?;
-    new.finish()?;
-    Ok(met.len())
+    let mut cameras: Vec<&CarGeometry> = Vec::new();
+    for log in &logs {
+        if !cameras.contains(&&log.geometry) {
+            cameras.push(&log.geometry);
+        }
+    }
+    let mut folders = Vec::new();
+    let mut time_ms = BEGIN_MS + u64::from(round - 1) * ROUND_MS;
+    for camera in cameras {
+        let of_camera: Vec<&Met> = met.iter().filter(|view| logs[view.place.0].geometry == *camera).collect();
+        if of_camera.is_empty() {
+            continue;
+        }
+        let out = match folders.len() {
+            0 => out.to_path_buf(),
+            others => {
+                let mut name = out.as_os_str().to_os_string();
+                name.push(format!("-camera-{}", others + 1));
+                PathBuf::from(name)
+            }
+        };
+        let new = NewFolder::create(&out)?;
+        write(&of_camera, camera, &mut time_ms, new.unfinished()).map_err(|error| new.explain(error))?;
+        new.finish()?;
+        folders.push(out);
+    }
+    Ok((folders, met.len()))
 }
 
-/// Writes `met` as a recording into `folder`. Pieces are sessions of their own.
-fn write(met: &[Met], round: u32, folder: &Path) -> Result<()> {
+/// Writes `met`, all seen by `camera`, as a recording into `folder`, with times after `time_ms`. Pieces are sessions of their own.
+fn write(met: &[&Met], camera: &CarGeometry, time_ms: &mut u64, folder: &Path) -> Result<()> {
+    let said = Description { camera: Some(camera.into()), unit: Some(Unit::Lock), ..Description::default() };
+    let file = folder.join(DESCRIPTION_FILE);
+    let text = toml::to_string(&said).map_err(|e| Error::Fault(format!("cannot be written as TOML: {e}")))?;
+    std::fs::write(&file, text).map_err(Error::io(&file))?;
     let images = folder.join("IMG");
     std::fs::create_dir_all(&images).map_err(Error::io(&images))?;
     let mut log = Vec::from(HEADER);
     let step_ms = (1000.0 / KEPT_HZ) as u64;
-    let mut time_ms = BEGIN_MS + u64::from(round - 1) * ROUND_MS;
     for (number, view) in met.iter().enumerate() {
         let new_piece = number > 0 && met[number - 1].place.0 != view.place.0;
-        time_ms += if new_piece { 60_000 } else { step_ms };
-        let name = picture_name("center", time_ms);
+        *time_ms += if new_piece { 60_000 } else { step_ms };
+        let name = picture_name("center", *time_ms);
         let file = images.join(&name);
         std::fs::write(&file, &view.jpeg).map_err(Error::io(&file))?;
         let numbers = [view.steering, 1.0, 0.0, view.speed_mph];

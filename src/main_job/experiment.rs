@@ -187,9 +187,12 @@ pub fn run(
 ) -> Result<Vec<ExperimentRow>> {
     let folder = tempfile::tempdir().map_err(Error::io(std::env::temp_dir()))?;
     let mut trials = Vec::new();
-    for (variant, recipe) in plan.subject.variants(&plan.recipe) {
-        // Not every colour space fits every network, nor every term every grouping; say so before minutes are spent.
+    let variants = plan.subject.variants(&plan.recipe);
+    // Not every colour space fits every network, nor every term every grouping; say so before minutes are spent.
+    for (variant, recipe) in &variants {
         Recipe::parse(variant, &recipe.to_toml()?, &[])?;
+    }
+    for (variant, recipe) in variants {
         for seed in 1..=plan.seeds {
             observer.observe(ExperimentEvent::Job(JobEvent::Notice(format!("{variant}, seed {seed}"))))?;
             let request = TrainRequest {

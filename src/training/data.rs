@@ -75,7 +75,10 @@ impl Data {
     ) -> Result<Data> {
         let mut recordings = Vec::new();
         let mut notices = Vec::new();
-        for path in paths.iter().chain(validate).chain(also) {
+        // What the user says of the recordings does not count for views, which steersman wrote itself.
+        let of_views = Description::default();
+        let of_user = paths.iter().chain(validate).map(|path| (path, said));
+        for (path, said) in of_user.chain(also.iter().map(|path| (path, &of_views))) {
             let mut recording = dataset::load_with(path, said, ImageCheck::Verify)?;
             recording.require_usable()?;
             recording.hash_pictures();
@@ -92,7 +95,7 @@ impl Data {
                 split_whole(of_split, paths.len(), &targets, &recipe.samples, &recipe.balance, seed)?
             }
         };
-        let targets = targets.with_views(&recordings[driven..]);
+        let targets = targets.with_views(&recordings[driven..], &recipe.labels);
         split.train_on(&recordings, driven)?;
         let taken_over = takeover::weigh(&mut split.training, &recordings, &recipe.samples, seed);
         if taken_over > 0 {
@@ -163,7 +166,7 @@ impl Data {
         (ids.iter().filter(|id| rows.binary_search(id).is_ok()).count(), ids.len())
     }
 
-    /// A hash over the rows of both sides, and the geometry that their labels go by, in hexadecimal digits.
+    /// A hash over the rows of both sides, and over what their labels go by beside the recorded steering: geometry, path and time, in hexadecimal digits.
     pub fn rows_hash(&self) -> String {
         let mut hash = Sha256::new();
         hash.update(self.targets.geometry_text());
@@ -171,6 +174,13 @@ impl Data {
             hash.update((side.len() as u64).to_le_bytes());
             for item in side {
                 hash.update(self.row_id(item).to_le_bytes());
+                self.targets.hash(
+                    *item,
+                    self.recordings[usize::from(item.recording)].rows[item.row as usize].steering,
+                    &mut |bits| {
+                        hash.update(bits.to_le_bytes());
+                    },
+                );
                 item.cameras().for_each(|camera| hash.update([camera as u8]));
             }
         }

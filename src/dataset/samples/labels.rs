@@ -66,7 +66,8 @@ impl LabelSpec {
         Ok(())
     }
 
-    fn look_ahead(&self, car: &CarGeometry) -> LookAhead {
+    /// How far ahead `car` aims at the driven path.
+    pub fn look_ahead(&self, car: &CarGeometry) -> LookAhead {
         LookAhead { seconds: self.look_ahead_s, min_m: self.min_wheelbases * car.wheelbase_m }
     }
 }
@@ -132,13 +133,13 @@ impl Targets {
     }
 
     /// The same with `views` behind them, single pictures each with the steering that leads back to a path: that is the label, whatever
-    /// the recipe says, and the car is taken to go on as it is steered.
-    pub fn with_views(mut self, views: &[Recording]) -> Targets {
+    /// the recipe says, and the car is taken to go on as it is steered. `spec` says how far ahead it aims.
+    pub fn with_views(mut self, views: &[Recording], spec: &LabelSpec) -> Targets {
         let geometry = self.recordings.iter().any(|recording| recording.geometry.is_some());
         for recording in views {
             let car = &recording.geometry;
             let driven = DrivenSessions::of(recording, car.clone());
-            let look_ahead = LabelSpec::default().look_ahead(car);
+            let look_ahead = spec.look_ahead(car);
             let speeds_mps = driven.sessions.iter().flat_map(|session| &session.speed_mps);
             let aims = speeds_mps.zip(&recording.rows).map(|(&speed_mps, row)| {
                 let look_ahead_m = look_ahead.distance_m(speed_mps);
@@ -233,6 +234,20 @@ impl Targets {
         [0.0, left_m, right_m][camera as usize]
     }
 
+    /// Hands `hash` the bits of what the samples of a row depend on beside `steering`, the recorded one: nothing where labels are the
+    /// recorded steering and nothing asks for geometry.
+    pub fn hash(&self, item: Item, steering: f32, hash: &mut impl FnMut(u32)) {
+        let recording = &self.recordings[usize::from(item.recording)];
+        let label = recording.labels[item.row as usize];
+        if label.to_bits() != steering.to_bits() {
+            hash(label.to_bits());
+        }
+        if let Some((_, aims)) = &recording.geometry {
+            let Aim { right_m, ahead_m, look_ahead_m } = aims[item.row as usize];
+            [right_m, ahead_m, look_ahead_m].into_iter().for_each(|m| hash(m.to_bits()));
+        }
+    }
+
     /// The geometry of all recordings in words, for a hash; nothing where none is asked for.
     pub fn geometry_text(&self) -> String {
         let cars = self.recordings.iter().filter_map(|recording| recording.geometry.as_ref());
@@ -260,13 +275,14 @@ fn later(recording: &Recording, labels: &[f32], shift_s: f64) -> Vec<f32> {
         let mut after = session.start;
         for row in session.clone() {
             let wanted_ms = time_ms(row) + 1000.0 * shift_s;
+            // Also where the shift is lost in rounding.
+            after = after.max(row + 1);
             while after < session.end && time_ms(after) < wanted_ms {
                 after += 1;
             }
-            if after == session.end {
+            if after >= session.end {
                 break;
             }
-            // `after` is behind `row`, as the shift is positive.
             let (from_ms, to_ms) = (time_ms(after - 1), time_ms(after));
             let share = (wanted_ms - from_ms) / (to_ms - from_ms);
             let (from, to) = (f64::from(labels[after - 1]), f64::from(labels[after]));
@@ -301,13 +317,13 @@ mod tests {
     fn views_keep_their_labels_and_lead_back_from_beside() {
         let driven = [recording_of(&[0.2; 40], 100)];
         let views = [recording_of(&[0.3, -0.4], 200)];
-        let targets = Targets::of(&driven, &path(), &geometric(), &Augmentation::default()).with_views(&views);
+        let targets = Targets::of(&driven, &path(), &geometric(), &Augmentation::default()).with_views(&views, &path());
         let view = |row| Item::new(1, row, [View::Centre]);
         assert_eq!([0, 1].map(|row| targets.label(view(row))), [Some(0.3), Some(-0.4)]);
         // Further to the right it steers more to the left, from wherever it was.
         let right = Offset { right_m: 0.5, ..Offset::default() };
         assert!([0, 1].iter().all(|&row| targets.beside(view(row), right) < targets.label(view(row)).unwrap() - 0.05));
-        assert_eq!(Targets::wheel(&driven).with_views(&views).label(view(1)), Some(-0.4));
+        assert_eq!(Targets::wheel(&driven).with_views(&views, &path()).label(view(1)), Some(-0.4));
     }
 
     #[test]

@@ -12,7 +12,7 @@ pub fn weigh(training: &mut Vec<Item>, recordings: &[Recording], samples: &Sampl
     if samples.takeover_weight == 1.0 || count == 0 {
         return count;
     }
-    // The streams of a split are numbered by sessions, of which there are fewer.
+    // Epoch 1: the split itself draws from epoch 0.
     let mut rng = rng(seed, Purpose::Split, 1, 0);
     let weighed = training.iter().flat_map(|item| {
         let times = if taken_over(item) {

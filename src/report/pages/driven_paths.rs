@@ -59,13 +59,13 @@ fn drawing(title: &str, session: &DrivenSession, [width, height]: [f64; 2]) -> S
     let mut svg = Svg::new(width, height);
     svg.text([14.0, 22.0], 15.0, Anchor::Start, "font-weight=\"600\"", title);
     let poses = session.path.poses();
-    let places = poses.iter().map(|pose| [pose.x_m, pose.y_m]);
+    let mut places = poses.iter().map(|pose| [pose.x_m, pose.y_m]);
     let Some(projection) = Projection::fitting(places.clone(), [16.0, 36.0, width - 16.0, height - 40.0]) else {
         return svg.finish();
     };
     let step = poses.len().div_ceil(MAX_POINTS).max(1);
     let mut points: Vec<[f64; 2]> = places.clone().step_by(step).map(|place| projection.place(place)).collect();
-    points.extend(places.last().map(|place| projection.place(place)));
+    points.extend(places.next_back().map(|place| projection.place(place)));
     svg.polyline(&points, &format!("stroke=\"{}\" stroke-width=\"2\"", series(0)));
     svg.dots(points.first().copied(), 8.0, INK, "");
     let bar_m = projection.bar_m(110.0);
