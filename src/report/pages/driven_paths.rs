@@ -95,6 +95,10 @@ mod tests {
         recording.rows.iter_mut().for_each(|row| row.speed_mph = f32::NAN);
         assert!(page_of(&recording).contains("14.4 m/s is assumed"));
         recording.rows.iter_mut().for_each(|row| row.speed_mph = 0.0);
+        assert!(page_of(&recording).contains("14.4 m/s is assumed"), "a column of zeros says no speed");
+        let (first, rest) = recording.rows.split_first_mut().unwrap();
+        first.speed_mph = 0.1;
+        rest.iter_mut().for_each(|row| row.speed_mph = 0.0);
         assert!(!page_of(&recording).contains("The driven path"), "a car that stands drives no path");
     }
 

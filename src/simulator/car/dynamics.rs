@@ -141,6 +141,16 @@ mod tests {
     }
 
     #[test]
+    fn the_rear_axle_moves_along_the_chord_of_its_circle() {
+        let mut car = Car::new(0.0, 0.0, 1.0, 0.0, 6.0);
+        car.step(Controls { steering: 1.0, throttle: 0.0 }, 0.0, 0.0);
+        let (dx, dy) = (car.x - REAR_AXLE_M * car.hx + REAR_AXLE_M, car.y - REAR_AXLE_M * car.hy);
+        let turn = car.hy.atan2(car.hx);
+        assert!(turn < -0.01, "to the right: {turn}");
+        assert!((dy.atan2(dx) - turn / 2.0).abs() < 1e-9, "{} {turn}", dy.atan2(dx));
+    }
+
+    #[test]
     fn grip_limits_the_turn() {
         let mut car = Car::new(0.0, 0.0, 1.0, 0.0, 12.0);
         let before = car.clone();

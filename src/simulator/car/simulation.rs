@@ -230,12 +230,15 @@ mod tests {
     #[test]
     fn progress_counts_a_lap_through_the_start() {
         let track = Track::load("coast").unwrap();
-        let start = Start { s_m: track.length_m - 5.0, reverse: false, offset_m: 0.0, heading_deg: 0.0 };
-        let mut simulation = Simulation::new(&track, start, 10.0);
-        for _ in 0..50 {
-            simulation.step(Controls { steering: 0.0, throttle: 0.2 });
+        for (reverse, s_m) in [(false, track.length_m - 5.0), (true, 5.0)] {
+            let start = Start { s_m, reverse, offset_m: 0.0, heading_deg: 0.0 };
+            let mut simulation = Simulation::new(&track, start, 10.0);
+            for _ in 0..50 {
+                simulation.step(Controls { steering: 0.0, throttle: 0.2 });
+            }
+            assert!((9.0..11.0).contains(&simulation.progress_m), "{}", simulation.progress_m);
+            let is_before_the_start = simulation.location.s_m > 10.0;
+            assert_eq!(is_before_the_start, reverse, "{}", simulation.location.s_m);
         }
-        assert!((9.0..11.0).contains(&simulation.progress_m), "{}", simulation.progress_m);
-        assert!(simulation.location.s_m < 10.0);
     }
 }
