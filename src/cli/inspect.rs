@@ -57,7 +57,8 @@ pub fn run(args: InspectArgs) -> Result<()> {
         return pool.install(|| fit_camera::run(&args.recordings, &args.reading));
     }
     let said = args.reading.said();
-    let treatment = Treatment { samples: recipe.samples.clone(), balance: recipe.balance.clone() };
+    let treatment =
+        Treatment { samples: recipe.samples.clone(), balance: recipe.balance.clone(), labels: recipe.labels };
     let (mut inspections, mut reports, mut failed) = (Vec::new(), Vec::new(), Vec::new());
     for path in &args.reading.expand(args.recordings)? {
         let mut bar = ShareBar::new(format!("looking at {}", path.display()), &stop);

@@ -3,7 +3,7 @@
 use super::suspicious::Suspicion;
 use super::{Pictures, Report, Steering, Treatment};
 use crate::dataset::recording::View;
-use crate::dataset::samples::Flip;
+use crate::dataset::samples::{Flip, LabelKind};
 use crate::dataset::unusable::Reason;
 
 /// Share of labels that are exactly zero above which straight frames crowd out the bends.
@@ -73,11 +73,12 @@ fn about_labels(simulated: bool, steering: &Steering, treatment: &Treatment, adv
         );
         return;
     }
-    let Treatment { samples, balance } = treatment;
+    let Treatment { samples, balance, labels } = treatment;
+    let by_path = labels.kind == LabelKind::Path;
     // What is left of them after the thinning of the recipe.
     let zeros_kept = zeros * balance.keep_zero.unwrap_or(1.0);
     let thinned = balance.histogram_max.is_some() || zeros_kept <= MANY_ZEROS * (1.0 - zeros + zeros_kept);
-    if zeros > MANY_ZEROS && !thinned {
+    if zeros > MANY_ZEROS && !thinned && !by_path {
         let keep = ZEROS_LEFT / (1.0 - ZEROS_LEFT) * (1.0 - zeros) / zeros;
         let keep = (20.0 * keep).round().max(1.0) / 20.0;
         advice.push(format!(
@@ -98,13 +99,13 @@ fn about_labels(simulated: bool, steering: &Steering, treatment: &Treatment, adv
         };
         advice.push(format!("{only}: mirror, with --set samples.flip=random, or drive the other way round as well"));
     }
-    if steering.full_lock_share > MUCH_FULL_LOCK {
+    if steering.full_lock_share > MUCH_FULL_LOCK && !by_path {
         advice.push(format!(
             "{:.0} % of the labels are at full lock: drive slower, or with mouse or gamepad, so that labels say how much to steer",
             100.0 * steering.full_lock_share
         ));
     }
-    if simulated && rows > 200 && (steering.distinct as f64) < FEW_LABELS * rows as f64 {
+    if simulated && !by_path && rows > 200 && (steering.distinct as f64) < FEW_LABELS * rows as f64 {
         advice.push(format!(
             "only {} different labels, as a keyboard gives them: mouse or gamepad give smoother ones",
             steering.distinct
@@ -120,7 +121,9 @@ fn about_rows(report: &Report, treatment: &Treatment, advice: &mut Vec<String>) 
         ));
     }
     let standing = report.standing_share.filter(|share| *share > MUCH_STANDING);
-    if let Some(share) = standing.filter(|_| treatment.samples.min_throttle.is_none()) {
+    if let Some(share) =
+        standing.filter(|_| treatment.samples.min_throttle.is_none() && treatment.labels.kind == LabelKind::Wheel)
+    {
         advice.push(format!(
             "{:.0} % of the rows stand still: leave them out, with --set samples.min_throttle=0 or by hand",
             100.0 * share
@@ -190,6 +193,11 @@ mod tests {
         treatment.balance.keep_zero = Some(0.9);
         assert_eq!(advice_for(&labels, &treatment).len(), 1);
         treatment.balance = Balance { histogram_bins: Some(21), histogram_max: Some(100), ..Balance::default() };
+        assert_eq!(advice_for(&labels, &treatment), Vec::<String>::new());
+        // The path has neither the zeros nor the few labels of a keyboard.
+        let mut treatment = Treatment::default();
+        treatment.samples.flip = Flip::Both;
+        treatment.labels.kind = LabelKind::Path;
         assert_eq!(advice_for(&labels, &treatment), Vec::<String>::new());
     }
 

@@ -15,7 +15,7 @@ use crate::dataset::description::Description;
 use crate::dataset::load::load_with;
 use crate::dataset::recording::Recording;
 use crate::dataset::rows::ImageCheck;
-use crate::dataset::samples::{Balance, SampleSpec};
+use crate::dataset::samples::{Balance, LabelSpec, SampleSpec};
 use crate::observer::{Observer, Progress};
 use describe::describe;
 pub use frames::Frame;
@@ -39,13 +39,15 @@ pub struct Inspection {
     pub report: Report,
 }
 
-/// What training will do with the rows, so that no advice asks for what is done already: two tables of the recipe.
+/// What training will do with the rows, so that no advice asks for what is done already: entries of the recipe.
 #[derive(Debug, Clone, Default)]
 pub struct Treatment {
     /// Which images of a row are used.
     pub samples: SampleSpec,
     /// Thinning out of over-frequent labels.
     pub balance: Balance,
+    /// Where labels come from. The driven path is smooth whatever the hands did, and has no label where the car stands.
+    pub labels: LabelSpec,
 }
 
 /// Reads the recording at `path`, of which the user says `said`, looks at its pictures and describes it. Where no image can be

@@ -220,7 +220,8 @@ fn from_left_to_right(recording: &Recording, count: usize) -> Vec<usize> {
 
 /// A label with its sign, which zero has not.
 fn signed(label: f32) -> String {
-    if label == 0.0 { "0".into() } else { format!("{label:+.3}") }
+    let text = format!("{label:+.3}");
+    if text.trim_start_matches(['+', '-']) == "0.000" { "0".into() } else { text }
 }
 
 fn camera_figure(image: &RgbImage, caption: String) -> Figure {
