@@ -38,6 +38,7 @@ mod share_bar;
 mod sim;
 mod summary;
 mod terminal;
+mod throttle;
 mod tracks;
 mod train;
 mod verdict;

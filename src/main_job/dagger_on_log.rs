@@ -10,7 +10,7 @@ use rayon::prelude::*;
 use super::job::{JobEvent, dagger_folder, observed};
 use super::on_recording::{judge_run, sides};
 use crate::dataset::udacity_writer::{HEADER, picture_name, write_row};
-use crate::dataset::{DESCRIPTION_FILE, Description, Unit};
+use crate::dataset::{DESCRIPTION_FILE, Description, OutputKind, Unit};
 use crate::error::{Error, Result};
 use crate::files::new_folder::NewFolder;
 use crate::geometry::CarGeometry;
@@ -90,11 +90,14 @@ struct Met {
     place: (usize, usize),
     jpeg: Vec<u8>,
     steering: f32,
+    /// Throttle and brake of the row whose picture was shown, where a label is made of them.
+    pedals: [f32; 2],
     speed_mph: f32,
 }
 
 /// Lets the model of the run in `path` drive on the training side of its recordings, and writes the views it met to the new folder
-/// `out` as a recording of round `round` (from 1), with the steering towards the driven path. What another camera saw goes to a folder
+/// `out` as a recording of round `round` (from 1), with the steering towards the driven path, the speed that was driven there, and for a
+/// recipe that learns it the throttle of the row whose picture is shown; a view of a row without one is left out. What another camera saw goes to a folder
 /// of its own: `out` with `-camera-2` and so on. Returns the folders and the number of views. Call it inside a rayon pool.
 ///
 /// # Errors
@@ -122,6 +125,7 @@ pub fn record_views(
     }
     let meters = logs.iter().map(|log| log.sessions[0].path.length_m() as usize + 1).sum();
     let tally = Tally::new(meters, observer);
+    let learns_throttle = recipe.outputs.index(OutputKind::Throttle).is_some();
     let every = (DRIVE_HZ / KEPT_HZ).round() as usize;
     let met = Mutex::new(Vec::new());
     logs.par_iter().enumerate().try_for_each(|(number, log)| {
@@ -133,7 +137,13 @@ pub fn record_views(
             let index = frames.fetch_add(1, Relaxed);
             let Some(pursuit) = frame.moment.pursuit.filter(|_| index % every == 0) else { return Ok(()) };
             let (jpeg, speed_mph) = (frame.view.to_jpeg(), (frame.moment.speed_mps * MPH_PER_MPS) as f32);
-            let view = Met { place: (number, index), jpeg, steering: pursuit as f32, speed_mph };
+            let row = &log.recording.rows[frame.moment.row];
+            let pedals = match learns_throttle {
+                true if row.throttle.is_nan() => return Ok(()),
+                true => [row.throttle, if row.brake.is_nan() { 0.0 } else { row.brake }],
+                false => [1.0, 0.0],
+            };
+            let view = Met { place: (number, index), jpeg, steering: pursuit as f32, pedals, speed_mph };
             met.lock().map_err(|_| Error::Fault("a drive has panicked".into()))?.push(view);
             Ok(())
         };
@@ -191,7 +201,7 @@ fn write(met: &[&Met], camera: &CarGeometry, time_ms: &mut u64, folder: &Path) -
         let name = picture_name("center", *time_ms);
         let file = images.join(&name);
         std::fs::write(&file, &view.jpeg).map_err(Error::io(&file))?;
-        let numbers = [view.steering, 1.0, 0.0, view.speed_mph];
+        let numbers = [view.steering, view.pedals[0], view.pedals[1], view.speed_mph];
         write_row(&mut log, ", ", [&format!("IMG/{name}"), &"", &""], numbers)
             .map_err(|source| Error::Io { path: folder.join("driving_log.csv"), source })?;
     }

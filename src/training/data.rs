@@ -86,7 +86,7 @@ impl Data {
             recordings.push(recording);
         }
         let driven = paths.len() + validate.len();
-        let targets = recipe.targets(&recordings[..driven]);
+        let targets = recipe.targets(&recordings[..driven], &recordings[driven..])?;
         notices.extend_from_slice(targets.notices());
         let mut split = match validate {
             [] => split(&recordings[..driven], &targets, &recipe.split, &recipe.samples, &recipe.balance, seed)?,
@@ -95,8 +95,7 @@ impl Data {
                 split_whole(of_split, paths.len(), &targets, &recipe.samples, &recipe.balance, seed)?
             }
         };
-        let targets = targets.with_views(&recordings[driven..], &recipe.labels);
-        split.train_on(&recordings, driven)?;
+        split.train_on(&recordings, driven, &targets)?;
         let taken_over = takeover::weigh(&mut split.training, &recordings, &recipe.samples, seed);
         if taken_over > 0 {
             let weight = recipe.samples.takeover_weight;
