@@ -167,6 +167,8 @@
 
 #[cfg(feature = "cli")]
 pub mod cli;
+#[cfg(feature = "live")]
+pub mod coach;
 #[cfg(feature = "training")]
 pub mod dataset;
 pub mod engine;

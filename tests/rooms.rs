@@ -5,7 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 /// The top-level rooms. A room may use those above it.
-const ROOMS: [&str; 28] = [
+const ROOMS: [&str; 29] = [
     "error",
     "suggestion",
     "text",
@@ -30,6 +30,7 @@ const ROOMS: [&str; 28] = [
     "simulator_client",
     "serve",
     "live",
+    "coach",
     "main_job",
     "cli",
     "lib",
