@@ -23,9 +23,6 @@ use crate::recipe::Recipe;
 const FORMAT: u32 = 1;
 const METADATA_KEY: &str = "steersman";
 const TRAINING_ROWS: &str = "training_rows";
-/// The meaning of the output `steering` of a model.
-pub(crate) const LABEL: &str =
-    "steering in [-1, 1], positive to the right; times recipe.full_lock_deg it is degrees of the front wheels";
 
 /// A trained network: recipe, parameters, and the record of its training.
 #[derive(Clone, Debug, PartialEq)]

@@ -430,7 +430,8 @@ mod tests {
             recipe.starts_with("there is no recipe `lente` (did you mean `lenet`?); built in are default,"),
             "{recipe}"
         );
-        let layers = SHIPPED[3].1.replacen("filters = 6", "filter = 6", 1);
+        let (_, lenet) = SHIPPED.iter().find(|(name, _)| *name == "lenet").unwrap();
+        let layers = lenet.replacen("filters = 6", "filter = 6", 1);
         let layer = Recipe::parse("mine.toml", &layers, &[]).unwrap_err().to_string();
         assert_eq!(layer, "recipe mine.toml: layers, entry 2: unknown field `filter` (did you mean `filters`?)");
     }

@@ -5,11 +5,14 @@ use serde::{Deserialize, Serialize};
 use super::labels::later;
 use crate::dataset::driven::recorded_speeds_mps;
 use crate::dataset::recording::Recording;
+use crate::geometry::MPS_PER_MPH;
 use crate::{Error, Result};
 
+/// What the output `steering` means.
+const STEERING: &str =
+    "steering in [-1, 1], positive to the right; times recipe.full_lock_deg it is degrees of the front wheels";
 /// Largest share of the rows of a recording that may lack a label beside the steering; they are left out.
 const MAX_UNRECORDED_SHARE: f64 = 0.2;
-const MPS_PER_MPH: f64 = 0.447_04;
 
 /// What an output of a network means.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -122,7 +125,7 @@ impl Outputs {
     /// What an output means, for people and for other programs.
     pub fn meaning(&self, kind: OutputKind) -> String {
         match kind {
-            OutputKind::Steering => crate::model_file::LABEL.into(),
+            OutputKind::Steering => STEERING.into(),
             OutputKind::Throttle => "throttle in [-1, 1], negative to brake".into(),
             OutputKind::Speed => {
                 format!("speed to drive at; times {} it is mph", self.top_speed_mph().unwrap_or_default())
