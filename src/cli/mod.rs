@@ -39,6 +39,7 @@ mod share_bar;
 mod sim;
 mod summary;
 mod terminal;
+mod throttle;
 mod tracks;
 mod train;
 mod verdict;

@@ -9,7 +9,7 @@ use steersman_kernels::Isa;
 use steersman_kernels::conv::ConvAlgorithm;
 
 use super::model_arg::model_file;
-use super::progress::JobDisplay;
+use super::progress::{self, JobDisplay};
 use super::recording_args::RecordingArgs;
 use super::verdict;
 use super::words::counted;
@@ -395,12 +395,13 @@ fn print_training(result: &TrainResult) {
         );
     }
     println!(
-        "epoch {}: validation MSE {}; centre camera {}, MAE {} deg, {} of the error of predicting zero",
+        "epoch {}: validation MSE {}; centre camera {}, MAE {} deg, {} of the error of predicting zero{}",
         result.best_epoch,
         or_dash(result.val_mse, 4),
         or_dash(result.val_center_mse, 4),
         or_dash(result.val_mae_deg, 2),
-        or_dash(result.relative_to_zero, 2)
+        or_dash(result.relative_to_zero, 2),
+        progress::beside_steering(result.val_throttle_mae, result.val_speed_mae_mph)
     );
     if !result.trained_on_held_out.is_empty() {
         println!("note: the model was {}", trained_on_held_out(&result.trained_on_held_out));

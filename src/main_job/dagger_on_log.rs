@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use super::job::{JobEvent, dagger_folder, observed, write_json};
 use super::on_recording::{judge_run, sides};
 use crate::dataset::udacity_writer::{HEADER, picture_name, write_row};
-use crate::dataset::{self, DESCRIPTION_FILE, Description, Unit};
+use crate::dataset::{self, DESCRIPTION_FILE, Description, OutputKind, Unit};
 use crate::error::{Error, Result};
 use crate::files::checksums;
 use crate::files::new_folder::NewFolder;
@@ -197,6 +197,8 @@ struct Met {
     place: (usize, usize),
     jpeg: Vec<u8>,
     steering: f32,
+    /// Throttle and brake of the row whose picture was shown, where a label is made of them.
+    pedals: [f32; 2],
     speed_mph: f32,
 }
 
@@ -247,9 +249,10 @@ fn of_camera(out: &Path, camera: usize) -> PathBuf {
 }
 
 /// Lets the model of the run in `path` drive on the training side of its recordings, and writes the views it met to the folder `out`
-/// as a recording of round `round` (from 1), with the steering towards the driven path. What another camera saw goes to a folder of its
-/// own: `out` with `-camera-2` and so on. Nothing is driven if `out` is there already. Frames whose picture cannot be read are left
-/// out. Call it inside a rayon pool.
+/// as a recording of round `round` (from 1), with the steering towards the driven path, the speed that was driven there, and for a recipe
+/// that learns it the throttle of the row whose picture is shown; a view of a row without one is left out. What another camera saw goes
+/// to a folder of its own: `out` with `-camera-2` and so on. Nothing is driven if `out` is there already. Frames whose picture cannot be
+/// read are left out. Call it inside a rayon pool.
 ///
 /// # Errors
 ///
@@ -279,6 +282,7 @@ pub fn record_views(
     }
     let meters = logs.iter().map(|log| log.sessions[0].path.length_m() as usize + 1).sum();
     let tally = Tally::new(meters, observer);
+    let learns_throttle = recipe.outputs.index(OutputKind::Throttle).is_some();
     let every = (DRIVE_HZ / KEPT_HZ).round() as usize;
     let met = Mutex::new(Vec::new());
     let drives = logs.par_iter().enumerate().map(|(number, log)| {
@@ -290,7 +294,13 @@ pub fn record_views(
             let index = frames.fetch_add(1, Relaxed);
             let Some(pursuit) = frame.moment.pursuit.filter(|_| index % every == 0) else { return Ok(()) };
             let (jpeg, speed_mph) = (frame.view.to_jpeg(), (frame.moment.speed_mps * MPH_PER_MPS) as f32);
-            let view = Met { place: (number, index), jpeg, steering: pursuit as f32, speed_mph };
+            let row = &log.recording.rows[frame.moment.row];
+            let pedals = match learns_throttle {
+                true if row.throttle.is_nan() => return Ok(()),
+                true => [row.throttle, if row.brake.is_nan() { 0.0 } else { row.brake }],
+                false => [1.0, 0.0],
+            };
+            let view = Met { place: (number, index), jpeg, steering: pursuit as f32, pedals, speed_mph };
             met.lock().map_err(|_| Error::Fault("a drive has panicked".into()))?.push(view);
             Ok(())
         };
@@ -349,7 +359,7 @@ fn write(met: &[&Met], camera: &CarGeometry, time_ms: &mut u64, folder: &Path) -
         let name = picture_name("center", *time_ms);
         let file = images.join(&name);
         std::fs::write(&file, &view.jpeg).map_err(Error::io(&file))?;
-        let numbers = [view.steering, 1.0, 0.0, view.speed_mph];
+        let numbers = [view.steering, view.pedals[0], view.pedals[1], view.speed_mph];
         write_row(&mut log, ", ", [&format!("IMG/{name}"), &"", &""], numbers)
             .map_err(|source| Error::Io { path: folder.join("driving_log.csv"), source })?;
     }

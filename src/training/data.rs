@@ -90,7 +90,10 @@ impl Data {
             recordings.push(recording);
         }
         let driven = paths.len() + validate.len();
-        let targets = recipe.targets(&recordings[..driven]);
+        let simulated = driven + also.len();
+        let [of_user, views, drives] =
+            [&recordings[..driven], &recordings[driven..simulated], &recordings[simulated..]];
+        let targets = recipe.targets(of_user, views, drives)?;
         notices.extend_from_slice(targets.notices());
         let mut split = match validate {
             [] => split(&recordings[..driven], &targets, &recipe.split, &recipe.samples, &recipe.balance, seed)?,
@@ -99,15 +102,12 @@ impl Data {
                 split_whole(of_split, paths.len(), &targets, &recipe.samples, &recipe.balance, seed)?
             }
         };
-        let simulated = driven + also.len();
-        let targets = targets.with_views(&recordings[driven..simulated], &recipe.labels);
-        split.train_on(&recordings[..simulated], driven)?;
+        split.train_on(&recordings[..simulated], driven, &targets)?;
         let taken_over = takeover::weigh(&mut split, &recordings, &recipe.samples, seed)?;
         if taken_over > 0 {
             let weight = recipe.samples.takeover_weight;
             split.notices.push(format!("{taken_over} training rows in which a person took over count {weight} times"));
         }
-        let targets = targets.with_drives(&recordings[simulated..], &recipe.labels);
         if !simulator.is_empty() {
             split.draw_from(&recordings, simulated, &targets, &recipe.samples, &recipe.balance, seed)?;
             split.notices.push(format!(

@@ -110,6 +110,12 @@ pub struct TrainResult {
     pub val_mae_deg: Option<f64>,
     /// Of the best epoch: `val_center_mse` ÷ mean squared label.
     pub relative_to_zero: Option<f64>,
+    /// Of the best epoch: mean absolute error of the throttle over the centre camera's images, of networks that give one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub val_throttle_mae: Option<f64>,
+    /// The same of the speed, mph.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub val_speed_mae_mph: Option<f64>,
     /// Training images an epoch.
     pub train_images: usize,
     /// Those of them that are the simulator's.
@@ -373,12 +379,15 @@ impl TrainingRun {
             Some(_) => recipe.batch.min(2 * most).max(capacity).next_multiple_of(PAIRS_CAPACITY),
             None => capacity,
         };
+        let plan = TrainingPlan::new(&network, plan_capacity);
         Ok(TrainingRun {
-            plan: TrainingPlan::new(&network, plan_capacity),
+            plan: match recipe.outputs.loss_weights() {
+                None => plan,
+                Some(weights) => plan.with_output_weights(&weights),
+            },
             smoothness,
-            validation: validation.map(|loader| {
-                Validation::new(loader, &network, capacity, recipe.full_lock_deg).with_path_labels(path_labels)
-            }),
+            validation: validation
+                .map(|loader| Validation::new(loader, &network, capacity, &recipe).with_path_labels(path_labels)),
             state: State {
                 average: recipe.averaging.map(|spec| WeightAverage::new(spec, &parameters, network.isa())),
                 parameters,
@@ -453,7 +462,7 @@ impl TrainingRun {
                 Some(validation) => validation.run(&self.network, self.state.model())?,
                 None => None,
             };
-            if validation.is_some_and(|v| !v.mse.is_finite()) {
+            if validation.is_some_and(|v| !(v.mse.is_finite() && v.weighted_mse.is_finite())) {
                 return Err(self.diverged("the validation loss is not finite"));
             }
             let record = self.end_epoch(validation, epoch_started);
@@ -575,6 +584,9 @@ impl TrainingRun {
             val_mae_deg: validation.map(|v| v.mae_deg),
             relative_to_zero: validation.and_then(|v| v.relative_to_zero),
             val_path_mse: validation.and_then(|v| v.path_mse),
+            val_weighted_mse: validation.map(|v| v.weighted_mse).filter(|_| self.recipe.outputs.count() > 1),
+            val_throttle_mae: validation.and_then(|v| v.throttle_mae),
+            val_speed_mae_mph: validation.and_then(|v| v.speed_mae_mph),
             learning_rate: progress.learning_rate,
             images: progress.images,
             train_seconds: progress.train_seconds,
@@ -586,7 +598,7 @@ impl TrainingRun {
 
         // Without a validation side, or with `keep = "last"`, the latest weights count as the best.
         let measure = match self.recipe.keep_by {
-            KeepBy::Loss => record.val_mse,
+            KeepBy::Loss => record.val_weighted_mse.or(record.val_mse),
             KeepBy::Path => record.val_path_mse,
         };
         let better = match (measure, progress.best_val_mse) {
@@ -601,7 +613,7 @@ impl TrainingRun {
             self.state.best = Some(best);
         }
         let progress = &mut self.state.progress;
-        if let Some(now) = record.val_mse {
+        if let Some(now) = record.val_weighted_mse.or(record.val_mse) {
             self.recipe.schedule.end_epoch(now, &mut progress.plateau);
         }
         if let Some(now) = measure {
@@ -732,6 +744,8 @@ impl TrainingRun {
             val_center_mse: best.val_center_mse,
             val_mae_deg: best.val_mae_deg,
             relative_to_zero: best.relative_to_zero,
+            val_throttle_mae: best.val_throttle_mae,
+            val_speed_mae_mph: best.val_speed_mae_mph,
             train_images: self.training.samples_used(),
             simulator_images: self.training.simulator_samples(),
             val_images: self.validation.as_ref().map_or(0, Validation::images),

@@ -58,7 +58,8 @@ pub struct SampleId {
 pub struct Batch {
     /// Network input, `[n][c][h][w]`.
     pub x: Vec<f32>,
-    /// Labels, `[n]`: steering with the corrections of camera and shift, + = right, not clamped.
+    /// Labels, `[n][outputs]`: steering with the corrections of camera and shift, + = right, not clamped; then the others of the row,
+    /// as they are.
     pub labels: Vec<f32>,
     /// Number of samples; less than asked for at the end of an epoch, and where images cannot be decoded.
     pub n: usize,
@@ -370,11 +371,12 @@ impl Loader {
         let len = self.spec.preprocessing.output_len();
         out.n = out.work.len();
         out.x.resize(out.n * len, 0.0);
-        out.labels.resize(out.n, 0.0);
-        let samples = out.x.par_chunks_exact_mut(len).zip(&mut out.labels).zip(&mut out.work);
-        samples.try_for_each(|((x, label), wanted)| -> Result<()> {
-            let made = self.with_scratch(|scratch| self.make_sample(wanted, x, scratch))??;
-            (*label, wanted.decoded) = (made.unwrap_or(0.0), made.is_some());
+        let outputs = self.targets.outputs();
+        out.labels.resize(out.n * outputs, 0.0);
+        let labels = out.labels.par_chunks_exact_mut(outputs);
+        let samples = out.x.par_chunks_exact_mut(len).zip(labels).zip(&mut out.work);
+        samples.try_for_each(|((x, labels), wanted)| -> Result<()> {
+            wanted.decoded = self.with_scratch(|scratch| self.make_sample(wanted, x, labels, scratch))??;
             Ok(())
         })?;
         self.close_gaps(out);
@@ -443,7 +445,7 @@ impl Loader {
 
     /// Moves samples up to where others could not be decoded, and notes where the rest come from. A pair goes as a whole.
     fn close_gaps(&self, out: &mut Batch) {
-        let len = self.spec.preprocessing.output_len();
+        let (len, outputs) = (self.spec.preprocessing.output_len(), self.targets.outputs());
         let mut n = 0;
         out.samples.clear();
         let pairs = out.pairs;
@@ -457,7 +459,7 @@ impl Loader {
             }
             if n < i {
                 out.x.copy_within(i * len..(i + 1) * len, n * len);
-                out.labels[n] = out.labels[i];
+                out.labels.copy_within(i * outputs..(i + 1) * outputs, n * outputs);
             }
             let (item, camera) = self.images[sample as usize / self.variants()];
             let Item { recording, row, .. } = self.items[item as usize];
@@ -466,7 +468,7 @@ impl Loader {
         }
         out.n = n;
         out.x.truncate(n * len);
-        out.labels.truncate(n);
+        out.labels.truncate(n * outputs);
     }
 
     /// Runs `work` with buffers that no other thread uses.

@@ -100,6 +100,8 @@ pub struct Split {
     pub low_throttle_rows: usize,
     /// Rows left out because the driven path does not say how to steer.
     pub unlabelled_rows: usize,
+    /// Whether some of them are without because their recording lacks a label beside the steering.
+    pub unrecorded: bool,
     /// Rows left out to balance the labels.
     pub balanced_rows: usize,
     /// What the reader should know.
@@ -134,6 +136,7 @@ pub fn split(
         guard_rows: 0,
         low_throttle_rows: 0,
         unlabelled_rows: 0,
+        unrecorded: targets.unrecorded(),
         balanced_rows: 0,
         notices: Vec::new(),
     };
@@ -187,10 +190,14 @@ impl Split {
             self.validation.len(),
             images(&self.validation)
         )];
+        let unlabelled = match self.unrecorded {
+            false => "left out because the car stands or its session ends, so that no path lies ahead",
+            true => "left out because a label was not recorded, or the car stands or its session ends",
+        };
         for (rows, why) in [
             (self.guard_rows, "within 1 s of a validation block, used on neither side"),
             (self.low_throttle_rows, "left out for low throttle"),
-            (self.unlabelled_rows, "left out because the car stands or its session ends, so that no path lies ahead"),
+            (self.unlabelled_rows, unlabelled),
             (self.balanced_rows, "left out to balance the labels"),
         ] {
             if rows > 0 {
@@ -206,12 +213,14 @@ impl Split {
     ///
     /// # Errors
     /// [`Error::Usage`] for too many recordings.
-    pub fn train_on(&mut self, recordings: &[Recording], first: usize) -> Result<()> {
+    pub fn train_on(&mut self, recordings: &[Recording], first: usize, targets: &Targets) -> Result<()> {
         if recordings.len() > usize::from(u16::MAX) {
             return Err(Error::Usage("more than 65,535 recordings".into()));
         }
-        let views: Vec<Item> =
+        let mut views: Vec<Item> =
             all_rows(recordings).into_iter().filter(|item| usize::from(item.recording) >= first).collect();
+        // Only a label beside the steering can be missing: a view has been given its steering.
+        self.unlabelled_rows += drop_unlabelled(&mut views, targets);
         if !views.is_empty() {
             self.notices.push(format!("{} views that a model met are trained on as well", views.len()));
         }

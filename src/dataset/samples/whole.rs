@@ -61,6 +61,7 @@ pub fn split_whole(
         guard_rows: 0,
         low_throttle_rows,
         unlabelled_rows,
+        unrecorded: targets.unrecorded(),
         balanced_rows,
         notices,
     })

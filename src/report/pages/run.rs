@@ -127,7 +127,14 @@ fn headline(page: &mut Page, result: &TrainResult, alone: bool) {
         ["speed".into(), format!("{:.0} images/s", result.images_per_second)],
         ["leak".into(), format!("{:.1} %", result.leak_percent)],
     ];
-    page.table(&["", ""], &rows.map(Vec::from));
+    let mut rows = rows.map(Vec::from).to_vec();
+    if let Some(mae) = result.val_throttle_mae {
+        rows.insert(4, vec!["centre camera: MAE of the throttle".into(), format!("{mae:.3}")]);
+    }
+    if let Some(mae) = result.val_speed_mae_mph {
+        rows.insert(4, vec!["centre camera: MAE of the speed".into(), format!("{mae:.2} mph")]);
+    }
+    page.table(&["", ""], &rows);
 }
 
 /// What the model is worth on the recordings it was trained on.

@@ -214,7 +214,7 @@ mod tests {
         let labels: Vec<f32> = (0..1200).map(|i| if i % 3 == 0 { 0.0 } else { 0.3 }).collect();
         let recordings = [recording_of(&labels, 100)];
         let recipe = Recipe::find("lenet", &[]).unwrap();
-        let targets = recipe.targets(&recordings);
+        let targets = recipe.targets(&recordings, &[], &[]).unwrap();
         let (spec, samples, balance) = (&recipe.split, &recipe.samples, &recipe.balance);
         let split = crate::dataset::split::split(&recordings, &targets, spec, samples, balance, 1).unwrap();
         let view = SplitView::of(&recordings, &targets, &split, &recipe);

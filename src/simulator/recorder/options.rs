@@ -8,6 +8,8 @@ use serde::Serialize;
 use crate::geometry::CarGeometry;
 use crate::simulator::car::dynamics::STEPS_PER_S;
 use crate::simulator::car::expert::Style;
+use crate::simulator::car::simulation::Simulation;
+use crate::simulator::car::speed::before_bends_mph;
 use crate::simulator::recorder::foreign_car;
 use crate::simulator::track::Track;
 use crate::{Error, Result};
@@ -40,6 +42,8 @@ pub struct RecordOptions {
     pub seed: u64,
     /// Speed to hold, mph.
     pub speed_mph: f64,
+    /// Drive slower than that before and in bends, so that the car is pushed sideways by at most this, m/s².
+    pub bends_mps2: Option<f64>,
     /// Strength of a disturbance of the steering that the labels do not show: standard deviation of the steering.
     pub noise: f64,
     /// Rows of the log for each second: 1, 2, 5, 10, 25 or 50.
@@ -51,6 +55,14 @@ pub struct RecordOptions {
 }
 
 impl RecordOptions {
+    /// The speed to aim at in `simulation`, mph.
+    pub fn target_mph(&self, simulation: &Simulation) -> f64 {
+        match self.bends_mps2 {
+            None => self.speed_mph,
+            Some(sideways_mps2) => before_bends_mph(simulation, self.speed_mph, sideways_mps2),
+        }
+    }
+
     /// Checks the options that hold for every driver: speed and rows per second.
     ///
     /// # Errors
@@ -58,6 +70,10 @@ impl RecordOptions {
     pub fn check(&self) -> Result<()> {
         if !(5.0..=30.0).contains(&self.speed_mph) {
             return Err(Error::Usage(format!("speed {} mph: 5 to 30 mph can be recorded", self.speed_mph)));
+        }
+        if self.bends_mps2.is_some_and(|mps2| !(0.5..=8.0).contains(&mps2)) {
+            let mps2 = self.bends_mps2.unwrap_or_default();
+            return Err(Error::Usage(format!("{mps2} m/s² in bends: 0.5 to 8 can be recorded")));
         }
         if self.hz == 0 || !STEPS_PER_S.is_multiple_of(self.hz) {
             return Err(Error::Usage(format!("{} rows a second: 1, 2, 5, 10, 25 or 50 can be recorded", self.hz)));
@@ -78,6 +94,7 @@ impl Default for RecordOptions {
             style: Style::Smooth,
             seed: 1,
             speed_mph: 20.0,
+            bends_mps2: None,
             noise: 0.0,
             hz: RECORD_HZ,
             format: LogFormat::Sample,
@@ -105,6 +122,9 @@ pub struct RecordingInfo {
     pub style: String,
     /// Speed held, mph; the highest, if by hand.
     pub speed_mph: f64,
+    /// Driven slower than that before and in bends, so that the car was pushed sideways by at most this, m/s².
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub bends_mps2: Option<f64>,
     /// Disturbance of the steering.
     pub noise: f64,
     /// Rows for each second.
@@ -125,6 +145,7 @@ impl RecordingInfo {
             recovery: options.recovery,
             style: if options.style == Style::Keyboard { "keyboard" } else { "smooth" }.to_string(),
             speed_mph: options.speed_mph,
+            bends_mps2: options.bends_mps2,
             noise: options.noise,
             hz: options.hz,
             rows,

@@ -130,7 +130,7 @@ fn check(options: &DriveOptions) -> Result<()> {
     if options.laps == 0 || options.runs == 0 {
         return fail("laps and runs must be at least 1".to_string());
     }
-    if let Speed::Fixed(mph) = options.speed
+    if let Speed::Fixed(mph) | Speed::Driver(mph) = options.speed
         && !(3.0..=30.0).contains(&mph)
     {
         return fail(format!("speed {mph} mph: 3 to 30 mph can be driven, or `auto`"));

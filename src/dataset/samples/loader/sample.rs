@@ -6,8 +6,14 @@ use crate::dataset::samples::{Correction, Mirror};
 use crate::geometry::{CarGeometry, Offset, PixelGrid, ViewWarp};
 
 impl Loader {
-    /// Writes a sample's network input to `x` and returns its label; `None` if the image cannot be decoded.
-    pub(super) fn make_sample(&self, wanted: &Wanted, x: &mut [f32], scratch: &mut Scratch) -> Result<Option<f32>> {
+    /// Writes a sample's network input to `x` and its labels to `labels`; `false` if the image cannot be decoded.
+    pub(super) fn make_sample(
+        &self,
+        wanted: &Wanted,
+        x: &mut [f32],
+        labels: &mut [f32],
+        scratch: &mut Scratch,
+    ) -> Result<bool> {
         let own = wanted.sample / self.variants() as u32;
         let (number, camera) = self.images[own as usize];
         let item = self.items[number as usize];
@@ -25,7 +31,7 @@ impl Loader {
                 .map_err(|message| self.report(picture, message))
                 .is_ok()
         })?;
-        let Some(made) = made else { return Ok(None) };
+        let Some(made) = made else { return Ok(false) };
         let preprocessing = &self.spec.preprocessing;
         let mut moved_px = 0.0;
         let keeps_rgb = keeps_rgb(&self.spec, self.training, self.flip);
@@ -55,7 +61,9 @@ impl Loader {
             }
             preprocessing.to_input(planes, x);
         });
-        Ok(Some(if mirrored { -label } else { label }))
+        labels[0] = if mirrored { -label } else { label };
+        labels[1..].copy_from_slice(self.targets.labels_beside_steering(item));
+        Ok(true)
     }
 
     /// Where beside the driven path a sample with the random numbers `stream` is shown from; `None` as it was taken.
