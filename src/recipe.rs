@@ -249,14 +249,15 @@ impl Recipe {
         Ok(network)
     }
 
-    /// The labels of `recordings`, and with `views` behind them, single pictures that a model met.
+    /// The labels of `recordings`, with `views` behind them, single pictures that a model met, and then `drives` of the simulator.
     ///
     /// # Errors
     ///
     /// [`Error::Data`] for recordings without what an output learns from.
-    pub fn targets(&self, recordings: &[Recording], views: &[Recording]) -> Result<Targets> {
-        let targets = self.steering_targets(recordings).with_views(views, &self.labels);
-        targets.with_outputs(recordings.iter().chain(views), &self.outputs, &self.labels)
+    pub fn targets(&self, recordings: &[Recording], views: &[Recording], drives: &[Recording]) -> Result<Targets> {
+        let targets =
+            self.steering_targets(recordings).with_views(views, &self.labels).with_drives(drives, &self.labels);
+        targets.with_outputs(recordings.iter().chain(views).chain(drives), &self.outputs, &self.labels)
     }
 
     /// The labels of the steering of `recordings`, whatever else the network gives.

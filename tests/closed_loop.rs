@@ -24,9 +24,10 @@ fn learn(folder: &Path, threads: usize) -> (TrainResult, TrackResult) {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
     pool.install(|| {
         let request = TrainRequest {
-            recordings: recordings(&folder.join("recordings"), &takes, &mut Unobserved).unwrap().0,
+            recordings: recordings(&folder.join("recordings"), &takes, None, &mut Unobserved).unwrap().0,
             validate: Vec::new(),
             also: Vec::new(),
+            simulator: Vec::new(),
             said: Description::default(),
             recipe: Recipe::find("lenet", &overrides).unwrap(),
             out: folder.join(format!("run-{threads}")),
@@ -136,7 +137,7 @@ fn a_job_that_was_stopped_goes_on_through_dagger_to_the_drives() {
 fn the_experiments_train_and_drive_every_variant() {
     let folder = tempfile::tempdir().unwrap();
     let scope = small_scope(folder.path());
-    let recordings = recordings(&scope.recordings, &scope.takes, &mut Unobserved).unwrap().0;
+    let recordings = recordings(&scope.recordings, &scope.takes, None, &mut Unobserved).unwrap().0;
     let go = |subject, stop: &StopSignal| {
         let plan = ExperimentPlan {
             subject,

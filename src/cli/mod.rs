@@ -226,6 +226,10 @@ struct RecipeArgs {
 }
 
 impl RecipeArgs {
+    fn is_given(&self) -> bool {
+        self.recipe.is_some() || !self.overrides.is_empty()
+    }
+
     fn find(&self) -> Result<Recipe> {
         self.find_or("default")
     }

@@ -84,6 +84,7 @@ enum Format {
 pub fn run(args: RecordArgs) -> Result<()> {
     let track = Track::load(&args.track)?;
     let options = RecordOptions {
+        car: None,
         laps: args.laps,
         reverse: args.reverse,
         recovery: args.recovery,

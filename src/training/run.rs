@@ -42,6 +42,9 @@ pub struct TrainRequest {
     pub validate: Vec<PathBuf>,
     /// Views that a model met, recordings too, which are always trained on.
     pub also: Vec<PathBuf>,
+    /// The simulator's set, of which each epoch draws the share that the recipe says; see
+    /// [`simulator_share`](crate::dataset::SampleSpec::simulator_share).
+    pub simulator: Vec<PathBuf>,
     /// What the user says about the recordings.
     pub said: Description,
     /// The experiment.
@@ -115,6 +118,9 @@ pub struct TrainResult {
     pub val_speed_mae_mph: Option<f64>,
     /// Training images an epoch.
     pub train_images: usize,
+    /// Those of them that are the simulator's.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub simulator_images: usize,
     /// Validation images.
     pub val_images: usize,
     /// Wall time of the run, interruptions left out.
@@ -139,6 +145,10 @@ pub struct TrainResult {
     pub profile: Option<ProfileReport>,
 }
 
+fn is_zero(number: &usize) -> bool {
+    *number == 0
+}
+
 /// Trains anew. Call it inside a rayon pool; `stop` and errors of `observer` end it after the current batch.
 ///
 /// # Errors
@@ -151,12 +161,24 @@ pub fn train(
     stop: &StopSignal,
 ) -> Result<TrainResult> {
     let started = Instant::now();
-    let TrainRequest { recordings, validate, also, said, recipe, out, seed, cache_mib, from, algorithm, profile } =
-        request;
+    let TrainRequest {
+        recordings,
+        validate,
+        also,
+        simulator,
+        said,
+        recipe,
+        out,
+        seed,
+        cache_mib,
+        from,
+        algorithm,
+        profile,
+    } = request;
     let profile = profile.then(Profile::start);
     let algorithm = algorithm.unwrap_or_else(ConvAlgorithm::of_environment);
     let start = from.as_ref().map(|from| Start::load(&from.model, from, &recipe, seed)).transpose()?;
-    let sources = Sources { paths: &recordings, validate: &validate, also: &also };
+    let sources = Sources { paths: &recordings, validate: &validate, also: &also, simulator: &simulator };
     let data = Data::prepare(sources, &said, &recipe, seed, cache_mib)?;
     let mut trained_on_held_out = held_out_tracks(&recordings)?;
     for track in start.iter().flat_map(|start| &start.trained_on_held_out) {
@@ -175,6 +197,7 @@ pub fn train(
         recordings: recordings.iter().map(absolute).collect::<Result<_>>()?,
         validate: validate.iter().map(absolute).collect::<Result<_>>()?,
         also: also.iter().map(absolute).collect::<Result<_>>()?,
+        simulator: simulator.iter().map(absolute).collect::<Result<_>>()?,
         cache_mib,
         said,
         rows_hash: data.rows_hash(),
@@ -260,6 +283,11 @@ pub fn resume_with(
         info.recordings.iter().chain(&info.validate).chain(&info.also).find(|path| moved.is_none() && !path.exists())
     {
         let message = "the recording is not there any more; if it was moved, say where it is with --recordings";
+        return Err(Error::data(gone, message));
+    }
+    if let Some(gone) = info.simulator.iter().find(|path| !path.exists()) {
+        let message = "this recording of the simulator's set is not there any more, and the run can only go on with it; any \
+                       `train RECORDING --with-simulator` in the same folder records it again";
         return Err(Error::data(gone, message));
     }
     let data = Data::of_run(&info, &recipe, info.cache_mib)?;
@@ -629,7 +657,7 @@ impl TrainingRun {
     fn copy_into(&self, folder: &RunFolder, epoch: u32) -> Result<()> {
         folder.write_recipe(&self.recipe)?;
         folder.write_json("run.json", &self.info)?;
-        for name in ["from.safetensors", "split.csv", RunFolder::JOB_NOTE] {
+        for name in ["from.safetensors", "split.csv", RunFolder::JOB_NOTE, RunFolder::DAGGER_NOTE] {
             if self.folder.file(name).is_file() {
                 std::fs::copy(self.folder.file(name), folder.file(name)).map_err(Error::io(folder.file(name)))?;
             }
@@ -663,7 +691,7 @@ impl TrainingRun {
                 version: env!("CARGO_PKG_VERSION").into(),
                 isa: self.network.isa().name().into(),
                 seed: self.info.seed,
-                recordings: self.info.recordings.iter().map(|path| path.display().to_string()).collect(),
+                recordings: self.info.trained_on(),
                 epochs: epoch,
                 train_loss: record.train_loss,
                 val_mse: record.val_mse,
@@ -719,6 +747,7 @@ impl TrainingRun {
             val_throttle_mae: best.val_throttle_mae,
             val_speed_mae_mph: best.val_speed_mae_mph,
             train_images: self.training.samples_used(),
+            simulator_images: self.training.simulator_samples(),
             val_images: self.validation.as_ref().map_or(0, Validation::images),
             seconds: progress.seconds,
             images_per_second: images as f64 / seconds,

@@ -134,17 +134,26 @@ impl Targets {
             || augmentation.shift_steering_per_px == Some(Correction::Geometry);
         let mut targets =
             Targets { recordings: Vec::new(), notices: Vec::new(), beside_steering: 0, unrecorded: false };
-        for recording in recordings {
-            if geometry {
-                targets.add_driven(recording, spec);
-            } else {
-                targets.recordings.push(OfRecording::of(steering(recording), None));
-            }
-            if let Some(of) = targets.recordings.last_mut().filter(|_| spec.shift_s > 0.0) {
-                of.labels = later(recording, &of.labels, spec.shift_s);
-            }
-        }
+        recordings.iter().for_each(|recording| targets.add(recording, spec, geometry));
         targets
+    }
+
+    /// The same with `more` behind them, drives whose labels are made as those of the first.
+    pub fn with_drives(mut self, more: &[Recording], spec: &LabelSpec) -> Targets {
+        let geometry = self.recordings.iter().any(|recording| recording.geometry.is_some());
+        more.iter().for_each(|recording| self.add(recording, spec, geometry));
+        self
+    }
+
+    fn add(&mut self, recording: &Recording, spec: &LabelSpec, geometry: bool) {
+        if geometry {
+            self.add_driven(recording, spec);
+        } else {
+            self.recordings.push(OfRecording::of(steering(recording), None));
+        }
+        if let Some(of) = self.recordings.last_mut().filter(|_| spec.shift_s > 0.0) {
+            of.labels = later(recording, &of.labels, spec.shift_s);
+        }
     }
 
     /// The same with `views` behind them, single pictures each with the steering that leads back to a path: that is the label, whatever

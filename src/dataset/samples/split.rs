@@ -88,6 +88,10 @@ pub struct Split {
     pub whole: bool,
     /// Training rows.
     pub training: Vec<Item>,
+    /// How often each of them counts in an epoch; each once if this is empty.
+    pub times: Vec<u32>,
+    /// Rows of the simulator's set, of which each epoch draws some.
+    pub simulator: Vec<Item>,
     /// Validation rows.
     pub validation: Vec<Item>,
     /// Rows next to validation blocks, used on neither side.
@@ -126,6 +130,8 @@ pub fn split(
         spec: spec.clone(),
         whole: false,
         training: Vec::new(),
+        times: Vec::new(),
+        simulator: Vec::new(),
         validation: Vec::new(),
         guard_rows: 0,
         low_throttle_rows: 0,
@@ -219,6 +225,41 @@ impl Split {
             self.notices.push(format!("{} views that a model met are trained on as well", views.len()));
         }
         self.training.extend(views);
+        Ok(())
+    }
+
+    /// All rows that are trained on, those of the simulator last.
+    pub fn trained_on(&self) -> impl Iterator<Item = &Item> {
+        self.training.iter().chain(&self.simulator)
+    }
+
+    /// Takes the rows of `recordings` from number `first` on, whose labels are among `targets`, as those of the simulator's set.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] for too many recordings, [`Error::Data`] if no row is left.
+    pub fn draw_from(
+        &mut self,
+        recordings: &[Recording],
+        first: usize,
+        targets: &Targets,
+        samples: &SampleSpec,
+        balance: &Balance,
+        seed: u64,
+    ) -> Result<()> {
+        if recordings.len() > usize::from(u16::MAX) {
+            return Err(Error::Usage("more than 65,535 recordings".into()));
+        }
+        let mut rows: Vec<Item> =
+            all_rows(recordings).into_iter().filter(|item| usize::from(item.recording) >= first).collect();
+        drop_low_throttle(&mut rows, recordings, samples);
+        drop_unlabelled(&mut rows, targets);
+        balance.apply(&mut rows, targets, seed);
+        set_cameras(&mut rows, recordings, samples.side_cameras.is_some());
+        if rows.is_empty() {
+            let message = "the recipe leaves out all of its rows".into();
+            return Err(Error::Data { place: "the simulator's set".into(), message });
+        }
+        self.simulator = rows;
         Ok(())
     }
 

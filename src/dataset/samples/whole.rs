@@ -55,6 +55,8 @@ pub fn split_whole(
         spec,
         whole: true,
         training,
+        times: Vec::new(),
+        simulator: Vec::new(),
         validation,
         guard_rows: 0,
         low_throttle_rows,

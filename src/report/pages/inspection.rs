@@ -387,7 +387,7 @@ fn training(page: &mut Page, recordings: &[Recording], recipe: &Recipe, seed: u6
     let all: Vec<f32> = recordings.iter().flat_map(|r| r.rows.iter().map(|row| row.steering)).collect();
     let before = histogram("Before: labels as recorded", HALF, "rows", &all);
     let (spec, samples, balance) = (&recipe.split, &recipe.samples, &recipe.balance);
-    let divided = recipe.targets(recordings, &[]).and_then(|targets| {
+    let divided = recipe.targets(recordings, &[], &[]).and_then(|targets| {
         let split = crate::dataset::split::split(recordings, &targets, spec, samples, balance, seed)?;
         Ok((targets, split))
     });

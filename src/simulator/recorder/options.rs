@@ -5,10 +5,12 @@ use std::path::Path;
 
 use serde::Serialize;
 
+use crate::geometry::CarGeometry;
 use crate::simulator::car::dynamics::STEPS_PER_S;
 use crate::simulator::car::expert::Style;
 use crate::simulator::car::simulation::Simulation;
 use crate::simulator::car::speed::before_bends_mph;
+use crate::simulator::recorder::foreign_car;
 use crate::simulator::track::Track;
 use crate::{Error, Result};
 
@@ -48,6 +50,8 @@ pub struct RecordOptions {
     pub hz: u64,
     /// How the log is written.
     pub format: LogFormat,
+    /// Camera mount and car to record as; those of the simulator if there is none.
+    pub car: Option<CarGeometry>,
 }
 
 impl RecordOptions {
@@ -74,6 +78,9 @@ impl RecordOptions {
         if self.hz == 0 || !STEPS_PER_S.is_multiple_of(self.hz) {
             return Err(Error::Usage(format!("{} rows a second: 1, 2, 5, 10, 25 or 50 can be recorded", self.hz)));
         }
+        if let Some(trouble) = self.car.as_ref().and_then(foreign_car::trouble) {
+            return Err(Error::Usage(format!("the simulator cannot record with this camera: {trouble}")));
+        }
         Ok(())
     }
 }
@@ -91,6 +98,7 @@ impl Default for RecordOptions {
             noise: 0.0,
             hz: RECORD_HZ,
             format: LogFormat::Sample,
+            car: None,
         }
     }
 }
