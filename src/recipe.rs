@@ -15,7 +15,7 @@ use steersman_kernels::{Backend, Isa};
 use crate::dataset::augment::Augmentation;
 use crate::dataset::preprocess::Preprocessing;
 use crate::dataset::split::SplitSpec;
-use crate::dataset::{Balance, Group, LabelSpec, Recording, SampleSpec, Targets};
+use crate::dataset::{Balance, Group, LabelKind, LabelSpec, Recording, SampleSpec, Targets};
 use crate::engine::loss::{Loss, Smoothness};
 use crate::engine::network::{LayerSpec, Network};
 use crate::engine::optimizer::{AveragingSpec, OptimizerSpec, Schedule, ScheduleSpec};
@@ -73,6 +73,9 @@ pub struct Recipe {
     /// Where labels come from.
     #[serde(default, skip_serializing_if = "LabelSpec::is_default")]
     pub labels: LabelSpec,
+    /// How the simulator's expert labels what the main job records; its own steering when absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub expert: Option<ExpertSpec>,
     /// Which images of a row are used, and what that adds to the label.
     #[serde(default)]
     pub samples: SampleSpec,
@@ -90,6 +93,16 @@ pub struct Recipe {
     /// The learning-rate schedule.
     #[serde(default)]
     pub schedule: ScheduleSpec,
+}
+
+/// How the simulator's expert labels what the main job records. Recordings that are there already keep their labels.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ExpertSpec {
+    /// The labels are the steering towards the point of the road's middle so far ahead of the rear axle, m; the expert itself
+    /// pursues one 6.13 m ahead at 20 mph. From farther, a place beside the middle asks for less steering, so that an error about
+    /// the place moves the wheel less.
+    pub label_look_ahead_m: f64,
 }
 
 /// Ends a run when the validation loss stops falling; the best weights become the model.
@@ -286,6 +299,16 @@ impl Recipe {
                 );
             }
         }
+        if let Some(ExpertSpec { label_look_ahead_m }) = self.expert {
+            if !(3.0..=30.0).contains(&label_look_ahead_m) {
+                return Err(format!("expert.label_look_ahead_m must be 3 to 30 m, not {label_look_ahead_m}"));
+            }
+            if self.labels.kind == LabelKind::Path {
+                return Err("expert.label_look_ahead_m labels with what no wheel did, so the driven path does not follow from it: \
+                            labels.kind must be \"wheel\""
+                    .into());
+            }
+        }
         self.optimizer.check().map_err(|message| format!("[optimizer] {message}"))?;
         if let Some(averaging) = &self.averaging {
             averaging.check().map_err(|message| format!("averaging: {message}"))?;
@@ -415,6 +438,8 @@ mod tests {
         assert!(error(&["smoothness={temporal=1}", "samples.group=rows"]).contains("samples.group"));
         assert!(error(&["averaging={kind='ema', decay=1}"]).contains("averaging: decay must lie in [0, 1)"));
         assert!(error(&["averaging={kind='ema', decays=0.9}"]).contains("did you mean `decay`?"));
+        assert!(error(&["expert.label_look_ahead_m=0.1"]).contains("3 to 30 m"));
+        assert!(error(&["expert.label_look_ahead_m=10", "labels.kind=path"]).contains("labels.kind must be"));
         assert!(error(&["name='../x'"]).contains("letters, digits"));
         assert!(error(&["early_stopping={patience_epochs=1}", "split.validation_share=0"]).contains("validation side"));
         assert!(error(&["layers=[{kind='dense', units=100000000000000}]"]).contains("units"));

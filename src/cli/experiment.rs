@@ -13,7 +13,7 @@ use crate::dataset::held_out::{self, trained_on_held_out};
 use crate::error::{Error, Result};
 use crate::main_job::experiment::{self, ExperimentEvent, ExperimentPlan, ExperimentRow, Subject, takes, write_csv};
 use crate::main_job::job::{RECORDINGS, training_set};
-use crate::main_job::training_set::RANDOM_TRACKS;
+use crate::main_job::training_set::{RANDOM_TRACKS, labelled};
 use crate::observer::Observer;
 use crate::simulator::Track;
 
@@ -112,7 +112,7 @@ pub fn run(args: ExperimentArgs) -> Result<()> {
     let out = new_csv(args.out, args.subject)?;
     let recordings = match given.is_empty() {
         true => {
-            let takes = takes(args.random_tracks as usize);
+            let takes = labelled(&takes(args.random_tracks as usize), &recipe);
             pool.install(|| training_set(RECORDINGS.as_ref(), &takes, &mut display, &stop))
         }
         false => Ok(given),

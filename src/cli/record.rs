@@ -96,6 +96,7 @@ pub fn run(args: RecordArgs) -> Result<()> {
             Format::Sample => LogFormat::Sample,
             Format::V2 => LogFormat::V2,
         },
+        label_look_ahead_m: None,
     };
     if args.manual {
         return drive_by_hand(&args, &track, &options);

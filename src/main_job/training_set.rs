@@ -9,6 +9,7 @@ use sha2::{Digest, Sha256};
 use crate::error::{Error, Result};
 use crate::files::new_folder::NewFolder;
 use crate::observer::{Observer, Parts, Progress};
+use crate::recipe::Recipe;
 use crate::simulator::{RecordOptions, Track, record};
 
 /// Random tracks in the set. Variety of looks teaches more than laps: each is driven for a fraction of a lap.
@@ -35,6 +36,9 @@ pub struct Take {
     pub recovery: bool,
     /// Draws start, light and texture.
     pub seed: u64,
+    /// See [`RecordOptions::label_look_ahead_m`].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub label_look_ahead_m: Option<f64>,
 }
 
 impl Take {
@@ -52,6 +56,7 @@ impl Take {
             recovery: self.recovery,
             seed: self.seed,
             hz: HZ,
+            label_look_ahead_m: self.label_look_ahead_m,
             ..Default::default()
         }
     }
@@ -63,7 +68,7 @@ pub fn takes() -> Vec<Take> {
     let mut takes = Vec::new();
     let mut take = |track: &str, laps, reverse, recovery| {
         let seed = FIRST_SEED + takes.len() as u64;
-        takes.push(Take { track: track.into(), laps, reverse, recovery, seed });
+        takes.push(Take { track: track.into(), laps, reverse, recovery, seed, label_look_ahead_m: None });
     };
     for track in ["lake", "mountain"] {
         for (laps, recovery) in [(0.8, false), (0.4, true)] {
@@ -78,6 +83,12 @@ pub fn takes() -> Vec<Take> {
         take(&track, 0.15, !odd, true);
     }
     takes
+}
+
+/// `takes` with the labels that `recipe` asks for.
+pub fn labelled(takes: &[Take], recipe: &Recipe) -> Vec<Take> {
+    let label_look_ahead_m = recipe.expert.map(|expert| expert.label_look_ahead_m);
+    takes.iter().map(|take| Take { label_look_ahead_m, ..take.clone() }).collect()
 }
 
 /// Everything that determines a set, as text: the same text gives the same pictures.
@@ -181,7 +192,14 @@ mod tests {
         let (mut renderer, mut frame) = (Renderer::default(), RgbFrame::default());
         for (name, recovery) in [("lake", false), ("mountain", true), ("random:1", false), ("random:2", true)] {
             let track = Track::load(name).unwrap();
-            let take = Take { track: name.into(), laps: 1.0, reverse: recovery, recovery, seed: FIRST_SEED };
+            let take = Take {
+                track: name.into(),
+                laps: 1.0,
+                reverse: recovery,
+                recovery,
+                seed: FIRST_SEED,
+                label_look_ahead_m: None,
+            };
             let (variant, samples) = (Variant::new(track.world(), take.seed), drive_expert(&track, &take.options()));
             for (k, sample) in samples.iter().enumerate() {
                 hash.update(sample.time_s.to_le_bytes());
@@ -225,8 +243,14 @@ mod tests {
     }
 
     fn few() -> Vec<Take> {
-        let take =
-            |track: &str, recovery, seed| Take { track: track.into(), laps: 0.01, reverse: true, recovery, seed };
+        let take = |track: &str, recovery, seed| Take {
+            track: track.into(),
+            laps: 0.01,
+            reverse: true,
+            recovery,
+            seed,
+            label_look_ahead_m: None,
+        };
         vec![take("lake", false, 1), take("lake", true, 2), take("random:4", false, 3)]
     }
 
@@ -244,6 +268,19 @@ mod tests {
         folders.sort();
         folders.dedup();
         assert_eq!(folders.len(), takes.len());
+    }
+
+    #[test]
+    fn takes_are_labelled_as_the_recipe_asks_and_their_sets_lie_apart() {
+        let with = |overrides: &[&str]| {
+            let overrides: Vec<String> = overrides.iter().map(|text| text.to_string()).collect();
+            labelled(&few(), &Recipe::find("lenet", &overrides).unwrap())
+        };
+        assert_eq!(with(&[]), few());
+        let far = with(&["expert.label_look_ahead_m=10"]);
+        assert!(far.iter().all(|take| take.options().label_look_ahead_m == Some(10.0)));
+        assert!(!settings(&few()).unwrap().contains("label"), "sets of other recipes are called as they were");
+        assert_ne!(settings(&far).unwrap(), settings(&few()).unwrap());
     }
 
     #[test]

@@ -3,7 +3,7 @@
 use crate::Result;
 use crate::simulator::camera::front_camera::FrontCamera;
 use crate::simulator::car::dynamics::{Controls, MPS_PER_MPH, STEP_S, STEPS_PER_S};
-use crate::simulator::car::expert::{Keyboard, Style, pursuit};
+use crate::simulator::car::expert::{Keyboard, Style, pursue, pursuit};
 use crate::simulator::car::noise::SteeringNoise;
 use crate::simulator::car::pose::BodyPose;
 use crate::simulator::car::simulation::{Simulation, Start};
@@ -21,6 +21,7 @@ struct ExpertDrive<'a> {
     speed: SpeedController,
     keyboard: Option<Keyboard>,
     noise: SteeringNoise,
+    label_look_ahead_m: Option<f64>,
     target_mph: f64,
     steps_per_row: u64,
 }
@@ -32,10 +33,11 @@ impl ExpertDrive<'_> {
             Some(keyboard) => keyboard.steer(&self.simulation),
             None => pursuit(&self.simulation),
         };
+        let label = label(&self.simulation, steering, self.label_look_ahead_m);
         let throttle = self.speed.throttle(self.target_mph, self.simulation.car.speed_mps / MPS_PER_MPH, STEP_S);
         let disturbed = steering + self.noise.next(STEP_S);
         self.simulation.step(Controls { steering: disturbed, throttle });
-        (steering, throttle)
+        (label, throttle)
     }
 
     fn sample(&self, time_s: f64, (steering, throttle): (f64, f64), body: BodyPose, speed_mps: f64) -> Sample {
@@ -60,6 +62,11 @@ impl ExpertDrive<'_> {
     }
 }
 
+/// The label where the expert steers by `steering`; see [`RecordOptions::label_look_ahead_m`].
+fn label(simulation: &Simulation, steering: f64, look_ahead_m: Option<f64>) -> f64 {
+    look_ahead_m.map_or(steering, |ahead_m| pursue(simulation, ahead_m))
+}
+
 /// Lets the expert drive as `options` say, and returns the rows, without pictures.
 pub fn drive_expert(track: &Track, options: &RecordOptions) -> Vec<Sample> {
     let mut rng = Rng::new(options.seed, "recording");
@@ -70,6 +77,7 @@ pub fn drive_expert(track: &Track, options: &RecordOptions) -> Vec<Sample> {
         speed: SpeedController::default(),
         keyboard: (options.style == Style::Keyboard).then(Keyboard::default),
         noise: SteeringNoise::new(options.seed, options.noise),
+        label_look_ahead_m: options.label_look_ahead_m,
         target_mph: options.speed_mph,
         steps_per_row: STEPS_PER_S / options.hz,
     };
@@ -131,7 +139,7 @@ pub fn drive_and_label(
         if step % STEPS_PER_S == 0 {
             by_expert = rng.unit() < expert_share;
         }
-        let label = pursuit(&simulation);
+        let expert = pursuit(&simulation);
         let speed_mph = simulation.car.speed_mps / MPS_PER_MPH;
         let throttle = controller.throttle(options.speed_mph, speed_mph, STEP_S);
         if step * DRIVE_HZ >= frames * STEPS_PER_S {
@@ -144,13 +152,13 @@ pub fn drive_and_label(
             samples.push(Sample {
                 time_s: simulation.time_s(),
                 body: simulation.body_pose(),
-                steering: label,
+                steering: label(&simulation, expert, options.label_look_ahead_m),
                 throttle: throttle.max(0.0),
                 brake: (-throttle).max(0.0),
                 speed_mph,
             });
         }
-        simulation.step(Controls { steering: if by_expert { label } else { answer }, throttle });
+        simulation.step(Controls { steering: if by_expert { expert } else { answer }, throttle });
         if simulation.cte_m().abs() > LOST_M || simulation.at_wall {
             simulation.put_back();
         }
@@ -194,6 +202,36 @@ mod tests {
         let helped = drive_and_label(&track, &options, &mut Zero, 0.5).unwrap();
         assert!(strength(&zero) > 2.0 * strength(&plain), "{} {}", strength(&zero), strength(&plain));
         assert!(strength(&helped) < strength(&zero));
+    }
+
+    #[test]
+    fn labels_from_farther_ahead_are_calmer_and_do_not_change_the_drive() {
+        let track = Track::load("lake").unwrap();
+        for recovery in [false, true] {
+            let options = RecordOptions { laps: 0.5, recovery, ..Default::default() };
+            let near = drive_expert(&track, &options);
+            let far = drive_expert(&track, &RecordOptions { label_look_ahead_m: Some(12.26), ..options });
+            assert!(near.len() > 50 && near.len() == far.len());
+            for (a, b) in near.iter().zip(&far) {
+                assert_eq!((a.body.origin, a.throttle, a.speed_mph), (b.body.origin, b.throttle, b.speed_mph));
+            }
+            let squares = |samples: &[Sample]| samples.iter().map(|s| s.steering * s.steering).sum::<f64>();
+            if recovery {
+                // Twice as far ahead as the expert's own 6.13 m, a place beside the line asks for a quarter of the steering and a
+                // turn for half of it.
+                assert!(squares(&far) < 0.25 * squares(&near), "{} {}", squares(&far), squares(&near));
+            } else {
+                // On the line both ask for the bend.
+                assert!((squares(&far) / squares(&near) - 1.0).abs() < 0.2, "{} {}", squares(&far), squares(&near));
+            }
+        }
+        // Whoever drives, the labels are those.
+        use crate::simulator::trial::driver::Expert;
+        let options = RecordOptions { laps: 0.1, label_look_ahead_m: Some(12.26), ..Default::default() };
+        let driven = drive_and_label(&track, &options, &mut Expert, 1.0).unwrap();
+        let labelled = drive_expert(&track, &options);
+        assert!(driven.len() > 20 && driven.len().abs_diff(labelled.len()) < 3);
+        assert!(driven.iter().zip(&labelled).all(|(a, b)| (a.steering - b.steering).abs() < 0.01));
     }
 
     #[test]

@@ -44,6 +44,9 @@ pub struct RecordOptions {
     pub hz: u64,
     /// How the log is written.
     pub format: LogFormat,
+    /// The labels are the steering towards the point of the line so far ahead of the rear axle, m, whatever moves the wheel; without
+    /// it they are what the expert does. Seen from farther, a place beside the line asks for less steering.
+    pub label_look_ahead_m: Option<f64>,
 }
 
 impl RecordOptions {
@@ -74,6 +77,7 @@ impl Default for RecordOptions {
             noise: 0.0,
             hz: RECORD_HZ,
             format: LogFormat::Sample,
+            label_look_ahead_m: None,
         }
     }
 }
@@ -101,6 +105,9 @@ pub struct RecordingInfo {
     pub noise: f64,
     /// Rows for each second.
     pub hz: u64,
+    /// See [`RecordOptions::label_look_ahead_m`].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub label_look_ahead_m: Option<f64>,
     /// Rows of the log.
     pub rows: usize,
 }
@@ -119,6 +126,7 @@ impl RecordingInfo {
             speed_mph: options.speed_mph,
             noise: options.noise,
             hz: options.hz,
+            label_look_ahead_m: options.label_look_ahead_m,
             rows,
         }
     }
