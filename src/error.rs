@@ -12,7 +12,7 @@ pub type Result<T, E = Error> = std::result::Result<T, E>;
 #[non_exhaustive]
 pub enum Error {
     /// A file or folder could not be read or written.
-    #[error("{path}: {source}", path = path.display())]
+    #[error("{path}: {source}{}", reading_remedy(path, source), path = path.display())]
     Io {
         /// The file or folder.
         path: PathBuf,
@@ -85,6 +85,20 @@ pub enum Error {
     /// The person at the keyboard pressed Ctrl-C.
     #[error("interrupted")]
     Interrupted,
+}
+
+/// What can be done where `path` cannot be read for the reason of `source`, to be put behind it; may be empty.
+fn reading_remedy(path: &Path, source: &std::io::Error) -> String {
+    use std::io::ErrorKind::{NotFound, PermissionDenied};
+    match source.kind() {
+        NotFound if path.is_relative() => match std::env::current_dir() {
+            Ok(here) => format!("; check the name, it is looked for in {}", here.display()),
+            Err(_) => "; check the name".into(),
+        },
+        NotFound => "; check the name".into(),
+        PermissionDenied => "; its owner can permit it".into(),
+        _ => String::new(),
+    }
 }
 
 impl Error {

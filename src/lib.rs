@@ -12,7 +12,7 @@
 //! | [`model_file`], [`pilot`] | what remains of a run; a model that steers |
 //! | [`metrics`], [`simulator`], [`replay`] | how well a model predicts; how well it drives on a track, and on a recording |
 //! | [`geometry`] | camera and car of a recording, the driven path, views from beside it |
-//! | [`report`], [`live`] | pages, pictures and films; a drive in the browser |
+//! | [`report`], [`live`], [`coach`] | pages, pictures and films; a drive in the browser; cleaning a recording there |
 //! | [`serve`], [`udacity`], [`simulator_client`] | drives Udacity's simulator; its messages; our simulator in its place |
 //! | [`exchange`] | models of other programs in, ours out for them |
 //! | [`main_job`], [`cli`] | what `train` does without a recording; the command line |
@@ -169,6 +169,8 @@
 pub mod calm;
 #[cfg(feature = "cli")]
 pub mod cli;
+#[cfg(feature = "live")]
+pub mod coach;
 #[cfg(feature = "training")]
 pub mod dataset;
 pub mod engine;

@@ -87,7 +87,11 @@ fn what_is_no_model_is_answered_with_what_to_do() {
         (&["summary", "empty"], "no model.safetensors in this folder"),
         (&["summary", "."], "is a folder of runs; name a model, such as ./run/model.safetensors"),
         (&["summary", "old.h5"], "is a model of Keras; steersman import"),
-        (&["summary", "nothing"], "nothing: No such file"),
+        (
+            &["summary", "nothing"],
+            "nothing: No such file or directory (os error 2); check the name, it is looked for in /",
+        ),
+        (&["train", "nothing", "--out", "run"], "check the name, it is looked for in /"),
         (&["evaluate", "run", "run"], "is the folder of a run, no recording"),
         (&["train", "run"], "is the folder of a run, no recording"),
         (&["train", "log", "--from", "lenet"], "lenet is a recipe, no model"),

@@ -38,10 +38,8 @@ static ALONE: Mutex<()> = Mutex::new(());
 /// Rows of a recording.
 const ROWS: usize = 6;
 
-/// Part of `STEERSMAN_FUZZ_SECONDS` that a reader takes: all of it, or a little of the default of 4 s.
-fn share() -> f64 {
-    if std::env::var("STEERSMAN_FUZZ_SECONDS").is_ok() { 1.0 } else { 0.05 }
-}
+/// Seconds that each reader is tried.
+const SECONDS: f64 = 0.2;
 
 /// A JPEG of 16x8 pixels.
 fn jpeg(row: usize, progressive: bool) -> Vec<u8> {
@@ -274,7 +272,7 @@ fn damaged_recordings_of_every_format_are_read_or_refused() {
             }
             result
         };
-        HAMMER.strike(name, &tree, share(), strike, read_damaged);
+        HAMMER.strike(name, &tree, SECONDS, strike, read_damaged);
     }
 }
 
@@ -295,7 +293,7 @@ fn damaged_archives_are_read_or_refused() {
         };
         written(&bytes);
         let expected = read(&path, None).unwrap();
-        HAMMER.strike(name, &bytes, share(), damage, |bytes: &Vec<u8>| {
+        HAMMER.strike(name, &bytes, SECONDS, damage, |bytes: &Vec<u8>| {
             written(bytes);
             let _ = recordings_below(&path);
             read(&path, Some(&expected)).map(drop)
@@ -342,7 +340,7 @@ fn damaged_pictures_are_decoded_or_refused() {
         ("progressive JPEG picture", encoded(true, 0, jpeg_encoder::ColorType::Rgb)),
         ("PNG picture", png),
     ] {
-        hammer.strike(name, &bytes, share(), damage, |bytes: &Vec<u8>| {
+        hammer.strike(name, &bytes, SECONDS, damage, |bytes: &Vec<u8>| {
             let mut image = RgbImage::default();
             let size = image_size(bytes);
             decode_rgb(bytes, &mut image)?;
@@ -415,7 +413,7 @@ fn damaged_runs_go_on_or_are_refused() {
                 damage_fields(random, bytes);
             }
         };
-        HAMMER.strike(name, &files, share(), strike, |files: &Tree| {
+        HAMMER.strike(name, &files, SECONDS, strike, |files: &Tree| {
             written(files);
             // It stops again after its next step.
             let stop = StopSignal::default();

@@ -133,3 +133,36 @@ fn a_drive_is_watched_with_its_saliency() {
     browser.wait_for("!document.getElementById('over').hidden");
     assert_eq!(served.code(), Some(130));
 }
+
+#[test]
+fn a_phone_in_the_dark_drives_with_a_finger_on_each_pedal() {
+    let folder = tempfile::tempdir().unwrap();
+    let served = serve(folder.path(), &["record", "--track", "lake", "--manual", "--out", "rec", "--json"]);
+    let Some(mut browser) = Browser::open(&format!("http://127.0.0.1:{}/", served.port), [390, 844]) else { return };
+    browser.wait_for("document.getElementById('link')?.textContent === 'you drive'");
+    for scheme in ["light", "dark"] {
+        let features = json!({ "features": [{ "name": "prefers-color-scheme", "value": scheme }] });
+        browser.tell("Emulation.setEmulatedMedia", features);
+        let fits = "document.documentElement.scrollWidth <= document.documentElement.clientWidth";
+        assert_eq!(browser.value(fits), true, "{scheme}");
+        let pale = "(() => { const light = text => { const [r, g, b] = text.match(/[0-9.]+/g).map(v => v / 255)\
+            .map(v => v <= .04045 ? v / 12.92 : ((v + .055) / 1.055) ** 2.4); return .2126 * r + .7152 * g + .0722 * b; };\
+            const paper = light(getComputedStyle(document.body).backgroundColor);\
+            return [...document.querySelectorAll('h1, p, figcaption, .gauge, #subject, #link')]\
+            .filter(e => e.offsetParent && e.textContent.trim()).map(e => [light(getComputedStyle(e).color), e.outerHTML])\
+            .filter(([ink]) => (Math.max(ink, paper) + .05) / (Math.min(ink, paper) + .05) < 4.5).map(([, html]) => html); })()";
+        assert_eq!(browser.value(pale), json!([]), "contrast, {scheme}");
+    }
+    assert!(browser.colours("map") > 4 && browser.colours("chart") > 4);
+    let [x, y] = browser.middle("accelerate");
+    assert!(y < 844.0, "the pedals are always in sight: {y}");
+    browser.mouse("mousePressed", x, y);
+    browser.wait_for("parseFloat(document.getElementById('speed').textContent) > 8");
+    browser.mouse("mouseReleased", x, y);
+    let [x, y] = browser.middle("brake");
+    browser.mouse("mousePressed", x, y);
+    browser.wait_for("document.getElementById('speed').textContent === '0.0 mph'");
+    browser.mouse("mouseReleased", x, y);
+    assert!(browser.complaints.is_empty(), "{:?}", browser.complaints);
+    served.stop();
+}

@@ -31,6 +31,7 @@ const ROOMS: [&str; 29] = [
     "simulator_client",
     "serve",
     "live",
+    "coach",
     "main_job",
     "cli",
     "lib",

@@ -33,6 +33,7 @@ mod progress;
 mod record;
 mod recording_args;
 mod replay;
+mod runs;
 mod serve;
 mod share_bar;
 mod sim;
@@ -124,6 +125,10 @@ enum Command {
     )]
     Compare(compare::CompareArgs),
     #[command(
+        after_help = "Examples:\n  steersman runs\n      those in the folder runs\n  steersman runs class-1 class-2 --out runs.html\n      those of two folders, as a page"
+    )]
+    Runs(runs::RunsArgs),
+    #[command(
         after_help = "Examples:\n  steersman summary --recipe pilotnet\n      the layers of a recipe\n  steersman summary runs/default-1/model.safetensors\n      those of a model, and how it was trained"
     )]
     Summary(summary::SummaryArgs),
@@ -159,6 +164,7 @@ pub fn main() -> ExitCode {
         Command::Video(args) => video::run(args),
         Command::Explain(args) => explain::run(args),
         Command::Compare(args) => compare::run(args),
+        Command::Runs(args) => runs::run(args),
         Command::Summary(args) => summary::run(args),
         Command::Bench(args) => bench::run(args, started),
         Command::Import(args) => import::run(args),

@@ -42,6 +42,7 @@ impl RecordingArgs {
             full_lock_deg: self.full_lock,
             hz: self.hz,
             labels: self.labels,
+            exclude: Vec::new(),
             camera: None,
         }
     }

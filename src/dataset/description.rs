@@ -28,6 +28,7 @@ pub(crate) const HZ: std::ops::RangeInclusive<f64> = 0.1..=1000.0;
 /// full_lock_deg = 25.0    # the angle in that unit, in degrees, that is steering 1
 /// hz = 30.0               # rows a second, where the recording has no times
 /// labels = "user"         # of a tub: user (default) or pilot
+/// exclude = [[41, 60]]    # rows that are left out: first and last line of the log, from 1
 /// [columns]               # of a log with a header: number from 1, or name
 /// steering = 4
 /// center = "image"
@@ -53,6 +54,10 @@ pub struct Description {
     /// Whose commands are the labels.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub labels: Option<Labels>,
+    /// Rows that are left out: first and last line of the log, from 1, both included. Tubs have lists of their own: the deleted
+    /// indexes of `manifest.json`, and `exclude.json` in format 1.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub exclude: Vec<[u32; 2]>,
     /// Camera and car.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub camera: Option<GeometryEntry>,
@@ -252,7 +257,7 @@ impl Description {
 
     /// These entries, and those of `other` where there is none here.
     pub fn or(mut self, other: Description) -> Description {
-        let Description { columns, unit, full_lock_deg, hz, labels, camera } = other;
+        let Description { columns, unit, full_lock_deg, hz, labels, exclude, camera } = other;
         for (column, reference) in columns {
             self.columns.entry(column).or_insert(reference);
         }
@@ -262,6 +267,7 @@ impl Description {
             full_lock_deg: self.full_lock_deg.or(full_lock_deg),
             hz: self.hz.or(hz),
             labels: self.labels.or(labels),
+            exclude: self.exclude.into_iter().chain(exclude).collect(),
             camera: self.camera.or(camera),
         }
     }
@@ -276,6 +282,9 @@ impl Description {
         }
         if self.full_lock_deg.is_some_and(|angle| !(1.0..=2000.0).contains(&angle)) {
             return Err("full_lock_deg: must be 1 to 2000".into());
+        }
+        if let Some([first, last]) = self.exclude.iter().find(|[first, last]| *first == 0 || first > last) {
+            return Err(format!("exclude: [{first}, {last}] is no range: first and last line of the log, from 1"));
         }
         if let Some(camera) = &self.camera {
             camera.resolve(CarGeometry::USUAL).map_err(|error| error.to_string())?;
@@ -319,6 +328,9 @@ mod tests {
         assert_eq!(both.columns[&Column::Center], ColumnRef::Name("image".into()));
         let again: Description = toml::from_str(&toml::to_string(&both).unwrap()).unwrap();
         assert_eq!(again, both);
+        for wrong in ["exclude = [[0, 4]]", "exclude = [[7, 6]]"] {
+            assert!(toml::from_str::<Description>(wrong).unwrap().validate().is_err(), "{wrong}");
+        }
         for wrong in ["unit = 'furlongs'", "speed = 3", "hz = 'fast'"] {
             assert!(toml::from_str::<Description>(wrong).is_err(), "{wrong}");
         }

@@ -3,10 +3,8 @@
 use std::ops::Range;
 
 use super::recording::Recording;
-use crate::geometry::{CarGeometry, DrivenPath, LookAhead};
+use crate::geometry::{CarGeometry, DrivenPath, LookAhead, MPS_PER_MPH};
 
-/// Metres a second in a mile an hour.
-const MPS_PER_MPH: f64 = 0.447_04;
 /// A car that makes less way stands, in wheelbases a second.
 const STANDING_WHEELBASES_PER_S: f64 = 0.1;
 /// Speed of a recording that says none, in wheelbases a second: 1.3 m/s for a small car, and no more than a guess.

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use super::description::Description;
 use super::formats::{FORMATS, Format, name_of_foreign, parent};
 use super::recording::{Recording, file_name};
-use super::rows::{ImageCheck, Rows};
+use super::rows::{ImageCheck, LeftOut, Rows};
 use super::store::Store;
 use crate::{Error, Result};
 
@@ -30,6 +30,14 @@ pub fn load(path: &Path) -> Result<Recording> {
 /// # Errors
 /// As [`load`]; [`Error::Usage`] for a number in `said` that cannot be.
 pub fn load_with(path: &Path, said: &Description, check: ImageCheck) -> Result<Recording> {
+    load_rows(path, said, check, LeftOut::Drop)
+}
+
+/// As [`load_with`], with a choice about the rows that a person has left out.
+///
+/// # Errors
+/// As [`load_with`].
+pub(crate) fn load_rows(path: &Path, said: &Description, check: ImageCheck, left_out: LeftOut) -> Result<Recording> {
     said.validate().map_err(Error::Usage)?;
     let store = Store::of(path)?;
     let (format, found) = match find(&store, path)? {
@@ -41,11 +49,11 @@ pub fn load_with(path: &Path, said: &Description, check: ImageCheck) -> Result<R
     let said = said.clone().or(Description::beside(&store, &folder)?);
     // A log that was named alone is a recording with the folder it lies in.
     let top = if store.is_folder(path) || store.is_archive() { path.to_path_buf() } else { parent(path) };
-    let top = if base.starts_with(&top) { top } else { folder };
-    let mut rows = Rows::new(&store, &top, &base, format, &said, check)?;
+    let top = if base.starts_with(&top) { top } else { folder.clone() };
+    let mut rows = Rows::new(&store, &top, &base, format, &said, (check, left_out))?;
     (format.read)(&store, &found, &mut rows)?;
     let collected = rows.collect()?;
-    collected.into_recording(path, store, format)
+    collected.into_recording(path, folder, store, format)
 }
 
 /// The format that finds something at `path`, and what it found.

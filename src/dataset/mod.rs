@@ -12,6 +12,7 @@
 
 mod description;
 mod driven;
+mod exclusions;
 mod formats;
 pub mod held_out;
 pub mod inspect;
@@ -25,11 +26,14 @@ mod unusable;
 
 pub use description::{Column, ColumnRef, DESCRIPTION_FILE, Description, Labels, Unit, parse_columns};
 pub use driven::{DrivenSession, DrivenSessions};
+pub use exclusions::Exclusions;
 pub use formats::{table as table_of_formats, udacity_writer};
+pub(crate) use load::load_rows;
 pub use load::{load, load_with, recordings_below};
 pub use pictures::{cache, colour, preprocess, resize};
 pub use recording::{Recording, Row, SESSION_GAP_MS, View};
 pub use rows::ImageCheck;
+pub(crate) use rows::{LeftOut, NO_NUMBER};
 pub use samples::{
     Balance, Correction, Flip, Group, Item, LabelKind, LabelSpec, Mirror, SampleSpec, Targets, augment, leak, loader,
     split, takeover, whole,

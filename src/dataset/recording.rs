@@ -59,11 +59,15 @@ pub struct Row {
     pub speed_mph: f32,
     /// Whether a person took the wheel from a model that drove: the log has a column `mode` that says `user`.
     pub taken_over: bool,
+    /// Whether a person has left it out; such rows are in a recording only if they were asked for.
+    pub(crate) excluded: bool,
+    /// What it is named by where a person leaves it out: the line of a log, the number of a tub's record.
+    pub(crate) number: u32,
     /// Time in milliseconds; only differences within a recording mean something.
     pub time_ms: i64,
     /// Line of the log, from 1.
     pub line: u32,
-    /// Rows written in another folder or session of the recorder have another number.
+    /// Rows written in another folder or session of the recorder, or behind rows that a person has left out, have another number.
     pub(super) source: u16,
     pub(super) images: [Option<Name>; 3],
 }
@@ -73,6 +77,8 @@ pub struct Row {
 pub struct Recording {
     /// The folder or file it was read from.
     pub path: PathBuf,
+    /// The folder of its log, where `steersman.toml` may lie.
+    pub(crate) folder: PathBuf,
     /// How it is written.
     pub(crate) format: &'static Format,
     /// The usable rows, in the order of the log.

@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use super::description::{Description, Unit};
+use super::description::{DESCRIPTION_FILE, Description, Unit};
 use super::formats::Format;
 use super::pictures::files::{Files, Locator};
 use super::recording::{Recording, Row, View, usual_preset};
@@ -26,6 +26,15 @@ const COMPARED: usize = 12;
 /// Kinds of suspicious labels that are kept to find their unit.
 const MAX_BEYOND: usize = 100_000;
 
+/// What becomes of the rows that a person has left out.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum LeftOut {
+    /// They are dropped and counted.
+    Drop,
+    /// They stay and say so: [`Row::excluded`]. For a person who looks through the recording.
+    Keep,
+}
+
 /// Whether the pictures of a recording are looked at while it is read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ImageCheck {
@@ -41,6 +50,10 @@ pub enum ImageCheck {
 pub(crate) struct Entry {
     /// Line of the log, from 1.
     pub line: u32,
+    /// What it is named by where a person leaves it out: the line of a log, the number of a tub's record.
+    pub number: u32,
+    /// Whether the recording itself marks it as left out by a person.
+    pub excluded: bool,
     /// Paths as written: centre, left, right.
     pub images: [Option<String>; 3],
     /// The label, in the unit of the recording.
@@ -55,6 +68,31 @@ pub(crate) struct Entry {
     pub time_ms: Option<i64>,
     /// Folder or session it was written in: rows of another one belong to another drive.
     pub source: String,
+    /// Stretches before it that were left out by a person: rows before and after one belong to different drives.
+    pub cuts: u32,
+}
+
+/// Of rows that cannot be named where a person leaves rows out.
+pub(crate) const NO_NUMBER: u32 = u32::MAX;
+
+impl Entry {
+    /// Of `line`, which is its number, too; with nothing recorded.
+    pub fn at(line: u32) -> Entry {
+        Entry {
+            line,
+            number: line,
+            excluded: false,
+            cuts: 0,
+            images: [const { None }; 3],
+            steering: f64::NAN,
+            throttle: f32::NAN,
+            brake: f32::NAN,
+            speed_mph: f32::NAN,
+            taken_over: false,
+            time_ms: None,
+            source: String::new(),
+        }
+    }
 }
 
 /// Where each camera's picture is, or what is wrong with it.
@@ -63,6 +101,14 @@ type Found = [Option<Result<(PathBuf, String), (Reason, String)>>; 3];
 /// Collects the rows of a recording.
 pub(crate) struct Rows<'a> {
     said: &'a Description,
+    /// What becomes of the rows that a person has left out.
+    left_out: LeftOut,
+    /// Rows that a person has left out.
+    excluded: usize,
+    /// Whether the last row was one of them.
+    cut: bool,
+    /// Stretches that a person has left out so far.
+    cuts: u32,
     locator: Locator<'a>,
     check: ImageCheck,
     unit: Unit,
@@ -71,7 +117,7 @@ pub(crate) struct Rows<'a> {
     /// The file that is read, for messages.
     place: Arc<str>,
     pending: Vec<(Entry, Arc<str>)>,
-    sources: BTreeMap<String, u16>,
+    sources: BTreeMap<(u32, String), u16>,
     rows: Vec<Row>,
     files: Files,
     unusable: Unusable,
@@ -95,10 +141,14 @@ impl<'a> Rows<'a> {
         base: &Path,
         format: &Format,
         said: &'a Description,
-        check: ImageCheck,
+        (check, left_out): (ImageCheck, LeftOut),
     ) -> Result<Self> {
         Ok(Self {
             said,
+            left_out,
+            excluded: 0,
+            cut: false,
+            cuts: 0,
             locator: Locator::new(store, top, base)?,
             check,
             unit: said.unit.unwrap_or(format.unit),
@@ -121,6 +171,13 @@ impl<'a> Rows<'a> {
     /// What the user says about the recording.
     pub fn said(&self) -> &'a Description {
         self.said
+    }
+
+    /// A row that a person has left out: whether it stays. If not, the rows before and after it belong to different sessions.
+    pub fn keeps_excluded(&mut self) -> bool {
+        let keeps = self.left_out == LeftOut::Keep;
+        self.cut |= !keeps;
+        keeps
     }
 
     /// Names the file that is read from now on.
@@ -146,6 +203,14 @@ impl<'a> Rows<'a> {
 
     /// Takes a row.
     pub fn push(&mut self, mut entry: Entry) -> Result<()> {
+        let named = |range: &[u32; 2]| (range[0]..=range[1]).contains(&entry.number);
+        entry.excluded |= self.said.exclude.iter().any(named);
+        if entry.excluded && !self.keeps_excluded() {
+            self.excluded += 1;
+            return Ok(());
+        }
+        self.cuts += u32::from(std::mem::take(&mut self.cut));
+        entry.cuts = self.cuts;
         if !entry.steering.is_finite() {
             self.unusable(entry.line, Reason::LabelOutOfRange, &format!("steering {} is no number", entry.steering));
             return Ok(());
@@ -213,12 +278,13 @@ impl<'a> Rows<'a> {
         let top = self.locator.top().to_path_buf();
         let images = self.files.add(images).map_err(|message| Error::data(&top, message))?;
         let next = self.sources.len();
-        let source = match self.sources.get(&row.source) {
+        let drive = (row.cuts, row.source);
+        let source = match self.sources.get(&drive) {
             Some(&number) => number,
             None => {
                 let number = u16::try_from(next)
-                    .map_err(|_| Error::data(&top, "the pictures lie in more than 65,535 folders"))?;
-                self.sources.insert(row.source, number);
+                    .map_err(|_| Error::data(&top, "the rows lie in more than 65,535 folders or stretches"))?;
+                self.sources.insert(drive, number);
                 number
             }
         };
@@ -228,6 +294,8 @@ impl<'a> Rows<'a> {
             brake: row.brake,
             speed_mph: row.speed_mph,
             taken_over: row.taken_over,
+            excluded: row.excluded,
+            number: row.number,
             time_ms: row.time_ms.unwrap_or(i64::MIN),
             line: row.line,
             source,
@@ -243,6 +311,11 @@ impl<'a> Rows<'a> {
             .then(|| unit_trouble(&self.rows, &mut self.beyond, &self.beyond_line));
         if self.clamped > 0 {
             self.notices.push(format!("{} labels beyond full lock count as full lock", self.clamped));
+        }
+        if self.excluded > 0 {
+            self.notices.push(format!("{} rows are left out by `exclude` in {DESCRIPTION_FILE}", self.excluded));
+        } else if !self.said.exclude.is_empty() && self.left_out == LeftOut::Drop {
+            self.notices.push(format!("`exclude` in {DESCRIPTION_FILE} names no row of the recording"));
         }
         Ok(Collected {
             check: self.check,
@@ -277,12 +350,20 @@ pub(crate) struct Collected {
 
 impl Collected {
     /// The recording at `path`, whose files lie in `store`.
-    pub fn into_recording(self, path: &Path, store: Store, format: &'static Format) -> Result<Recording> {
+    /// `folder` is that of the log.
+    pub fn into_recording(
+        self,
+        path: &Path,
+        folder: PathBuf,
+        store: Store,
+        format: &'static Format,
+    ) -> Result<Recording> {
         let camera = self.camera.unwrap_or_default();
         let geometry = camera.resolve(usual_preset(format.id))?;
         let notices = store.notice().into_iter().chain(self.notices).collect();
         let mut recording = Recording {
             path: path.into(),
+            folder,
             format,
             rows: self.rows,
             sessions: Vec::new(),

@@ -46,6 +46,8 @@ pub(crate) fn recording_of(steering: &[f32], step_ms: i64) -> Recording {
         brake: 0.0,
         speed_mph: 20.0,
         taken_over: false,
+        excluded: false,
+        number: i as u32 + 1,
         time_ms: i as i64 * step_ms,
         line: i as u32 + 1,
         source: 0,
@@ -53,6 +55,7 @@ pub(crate) fn recording_of(steering: &[f32], step_ms: i64) -> Recording {
     });
     Recording {
         path: "memory".into(),
+        folder: "memory".into(),
         format: super::formats::FORMATS[3],
         rows: rows.collect(),
         sessions: std::iter::once(0..steering.len()).filter(|session| !session.is_empty()).collect(),

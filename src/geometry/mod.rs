@@ -6,6 +6,11 @@
 //!
 //! All functions use the `libm` crate for angles, so the same recording gives the same bits on every machine.
 
+/// Metres a second in a mile an hour. Logs give speeds in mph, as Udacity's simulator does.
+pub const MPS_PER_MPH: f64 = 0.447_04;
+/// Miles an hour in a metre a second.
+pub const MPH_PER_MPS: f64 = 1.0 / MPS_PER_MPH;
+
 pub mod camera;
 pub mod driven_path;
 pub mod view_warp;

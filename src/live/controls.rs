@@ -18,6 +18,8 @@ pub enum Action {
     Record,
     /// Hold the accelerator, or release it.
     Cruise,
+    /// Take the last seconds out of the recording.
+    Erase,
     /// Put the car onto the middle of the road.
     PutBack,
     /// The same, facing the other way.
@@ -59,6 +61,7 @@ impl Wheel {
             }
             Request::Record => Some(Action::Record),
             Request::Cruise => Some(Action::Cruise),
+            Request::Erase => Some(Action::Erase),
             Request::PutBack => Some(Action::PutBack),
             Request::TurnRound => Some(Action::TurnRound),
             Request::Finish => Some(Action::Finish),

@@ -29,6 +29,8 @@ pub enum Request {
     Record,
     /// Hold the accelerator, or release it.
     Cruise,
+    /// Take the last seconds out of the recording.
+    Erase,
     /// Put the car back onto the middle of the road, standing.
     PutBack,
     /// The same, facing the other way.

@@ -1,8 +1,7 @@
 //! Serves the page and its WebSocket, to this machine only.
 
-use std::io::{Read as _, Write as _};
-use std::net::{Ipv4Addr, Shutdown, SocketAddr, TcpListener};
-use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::io::Write as _;
+use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
@@ -14,9 +13,10 @@ use super::controls::Wheel;
 use super::hub::Hub;
 use super::messages::{Farewell, Hello, Request, State};
 use crate::error::{Error, Result};
-use crate::net::connections::{Connections, Peer, Rank};
+use crate::net::connections::{Peer, Rank};
 use crate::net::handshake;
-use crate::net::http::{self, BadHead, Head};
+use crate::net::http::{self, Head};
+use crate::net::loopback::{self, Request as Received};
 use crate::net::socket::{Socket, is_timeout};
 
 /// Default port of the page.
@@ -30,26 +30,16 @@ const HEADERS: &str = "Content-Security-Policy: default-src 'none'; script-src '
     img-src data:; connect-src 'self' ws://127.0.0.1:* ws://localhost:*; base-uri 'none'; form-action 'none'; \
     frame-ancestors 'none'\r\nX-Frame-Options: DENY\r\nX-Content-Type-Options: nosniff\r\nReferrer-Policy: no-referrer\r\n\
     Cache-Control: no-store\r\n";
-/// Largest number of open connections.
-const MAX_CONNECTIONS: usize = 32;
-/// Longest time that a new connection waits until another has made room.
-const ROOM_PATIENCE: Duration = Duration::from_millis(100);
 /// Time without a request after which a page is idle, and makes room if there are too many connections.
 const IDLE_TIME: Duration = Duration::from_secs(5);
-/// Longest time for a whole request.
-const MAX_REQUEST_TIME: Duration = Duration::from_secs(5);
 /// Time that a browser has to read the last words.
 const FAREWELL: Duration = Duration::from_millis(300);
-/// Pause between two checks of the listener.
-const LISTEN_PAUSE: Duration = Duration::from_millis(5);
 /// Tick of a connection that waits for a frame: the longest delay of a frame.
 const QUICK_TICK: Duration = Duration::from_millis(4);
 /// Tick of the other connections.
 const SLOW_TICK: Duration = Duration::from_millis(40);
 /// Longest message of a page, bytes.
 const MAX_MESSAGE: usize = 4096;
-/// Stack of a connection's thread, bytes.
-const STACK: usize = 1 << 20;
 
 /// Serves a page in threads of its own until it is dropped.
 #[derive(Debug)]
@@ -73,7 +63,12 @@ impl Live {
         let hub = Arc::new(Hub::new(hello, by_hand));
         let shared = hub.clone();
         let thread = std::thread::Builder::new().name("live".into());
-        let listener = thread.spawn(move || listen(&listener, address.port(), &shared)).map_err(fault)?;
+        let listener = thread
+            .spawn(move || {
+                let (over, port) = (|| shared.over().is_some(), address.port());
+                loopback::listen(&listener, &over, &|peer| serve(peer, port, &shared));
+            })
+            .map_err(fault)?;
         Ok(Live { hub, address, listener: Some(listener) })
     }
 
@@ -122,71 +117,27 @@ impl Drop for Live {
     }
 }
 
-/// Accepts connections until the end, and waits until they have ended.
-fn listen(listener: &TcpListener, port: u16, hub: &Hub) {
-    let connections = Connections::new(MAX_CONNECTIONS);
-    std::thread::scope(|scope| {
-        let mut id = 0;
-        while hub.over().is_none() {
-            let Ok((stream, _)) = listener.accept() else {
-                // No client, or the connection is gone already, or the process has no file handle left.
-                std::thread::sleep(LISTEN_PAUSE);
-                continue;
-            };
-            id += 1;
-            // A connection without room is dropped, and so closed.
-            let (Some(peer), _) = connections.add(id, &Arc::new(stream), ROOM_PATIENCE) else { continue };
-            let connections = &connections;
-            let thread = std::thread::Builder::new().name(format!("viewer {id}")).stack_size(STACK);
-            let serve = move || {
-                // The browser opens another connection if this one fails.
-                let _ = catch_unwind(AssertUnwindSafe(|| serve(&peer, port, hub)));
-                // It may be closed already.
-                let _ = peer.stream.shutdown(Shutdown::Both);
-                connections.remove(id);
-            };
-            if thread.spawn_scoped(scope, serve).is_err() {
-                connections.remove(id);
-            }
-        }
-    });
-}
-
 /// Answers one request. An error ends the connection; there is no one to tell.
 fn serve(peer: &Peer, port: u16, hub: &Hub) -> std::io::Result<()> {
     let mut socket = Socket::new(peer.stream.try_clone()?, SLOW_TICK)?;
-    let began = Instant::now();
-    let mut bytes = Vec::with_capacity(1024);
-    while began.elapsed() < MAX_REQUEST_TIME && hub.over().is_none() {
-        let mut chunk = [0; 1024];
-        socket.begin_tick();
-        match socket.read(&mut chunk) {
-            Ok(0) => return Ok(()),
-            Ok(len) => bytes.extend_from_slice(&chunk[..len]),
-            Err(error) if is_timeout(&error) => continue,
-            Err(error) => return Err(error),
+    let (bytes, answer) = match loopback::read_request(&mut socket, &|| hub.over().is_some())? {
+        None => return Ok(()),
+        Some(Received::Bad(response)) => (Vec::new(), Answer::Say(response)),
+        Some(Received::Head(bytes)) => {
+            let answer = Head::parse(&bytes).ok().flatten().map(|head| answer(&head, port));
+            (bytes, answer.expect("it was read as a whole request"))
         }
-        let answer = match Head::parse(&bytes) {
-            Ok(None) => continue,
-            Ok(Some(head)) => answer(&head, port),
-            Err(BadHead::TooLong) => {
-                Answer::Say(http::plain("431 Request Header Fields Too Large", "the request is longer than 8 KiB"))
-            }
-            Err(BadHead::NotHttp) => Answer::Say(http::plain("400 Bad Request", "this is no HTTP request")),
-        };
-        return match answer {
-            Answer::Say(response) => {
-                socket.write_all(response.as_bytes())?;
-                socket.finish(FAREWELL);
-                Ok(())
-            }
-            Answer::Open { response, len } => {
-                socket.write_all(response.as_bytes())?;
-                peer.set_rank(Rank::WebSocket);
-                show(socket, bytes[len..].to_vec(), peer, hub);
-                Ok(())
-            }
-        };
+    };
+    match answer {
+        Answer::Say(response) => {
+            socket.write_all(response.as_bytes())?;
+            socket.finish(FAREWELL);
+        }
+        Answer::Open { response, len } => {
+            socket.write_all(response.as_bytes())?;
+            peer.set_rank(Rank::WebSocket);
+            show(socket, bytes[len..].to_vec(), peer, hub);
+        }
     }
     Ok(())
 }
@@ -201,14 +152,9 @@ enum Answer {
 
 fn answer(head: &Head, port: u16) -> Answer {
     let refuse = |status: &str, sentence: &str| Answer::Say(http::plain(status, sentence));
-    let mut own = vec![format!("127.0.0.1:{port}"), format!("localhost:{port}")];
-    if port == 80 {
-        // Browsers leave port 80 out.
-        own.extend(["127.0.0.1".into(), "localhost".into()]);
-    }
-    let is_own = |host: &str| own.iter().any(|own| own.eq_ignore_ascii_case(host));
-    let Some(host) = head.header("host").filter(|host| is_own(host)) else {
-        return refuse("403 Forbidden", &format!("this page is served as http://{}/ only", own[0]));
+    let host = match loopback::own_host(head, port) {
+        Ok(host) => host,
+        Err(response) => return Answer::Say(response),
     };
     let path = head.target.split('?').next().unwrap_or("");
     if path != "/" && path != SOCKET_PATH {
@@ -220,7 +166,7 @@ fn answer(head: &Head, port: u16) -> Answer {
     if path == "/" {
         return Answer::Say(http::response("200 OK", "text/html; charset=utf-8", HEADERS, PAGE));
     }
-    if head.origin().is_some_and(|origin| origin.trim() != format!("http://{host}")) {
+    if !loopback::is_own_page(head, host) {
         return refuse("403 Forbidden", "only the page that is served here may connect");
     }
     if !handshake::is_requested(head) {

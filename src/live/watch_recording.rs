@@ -6,7 +6,7 @@ use super::messages::{Hello, State};
 use super::real_time::RealTime;
 use super::server::Live;
 use crate::error::Result;
-use crate::geometry::{Offset, Pose};
+use crate::geometry::{MPH_PER_MPS, Offset, Pose};
 use crate::observer::StopSignal;
 use crate::pilot::Pilot;
 use crate::replay::{MAX_OFFSET_M, ReplayFrame, ReplayLog};
@@ -18,7 +18,6 @@ use crate::report::explain::saliency::Saliency;
 const TICK: Duration = Duration::from_millis(50);
 /// Room between the paths of two sessions on the map, m.
 const BETWEEN_M: f64 = 10.0;
-const MPH_PER_MPS: f64 = 1.0 / 0.447_04;
 
 /// Shows drives along the sessions of a recording on a page, one after the other, in real time.
 pub struct WatchRecording<'a> {

@@ -13,7 +13,7 @@ use crate::dataset::udacity_writer::{HEADER, picture_name, write_row};
 use crate::dataset::{DESCRIPTION_FILE, Description, Unit};
 use crate::error::{Error, Result};
 use crate::files::new_folder::NewFolder;
-use crate::geometry::CarGeometry;
+use crate::geometry::{CarGeometry, MPH_PER_MPS};
 use crate::observer::{Observer, Progress, StopSignal, Tally};
 use crate::picture::RgbImage;
 use crate::pilot::Pilot;
@@ -26,7 +26,6 @@ const KEPT_HZ: f64 = 5.0;
 const BEGIN_MS: u64 = 1_767_268_800_000;
 /// Time from round to round there, so that pictures of different rounds have different names.
 const ROUND_MS: u64 = 365 * 86_400_000;
-const MPH_PER_MPS: f64 = 1.0 / 0.447_04;
 
 /// A training run and what its model is worth on the recordings.
 #[derive(Debug)]

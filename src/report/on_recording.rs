@@ -4,13 +4,13 @@ use std::fmt::Write as _;
 
 use crate::error::{Error, Result};
 use crate::files::new_folder::NewFolder;
+use crate::geometry::MPH_PER_MPS;
 use crate::replay::{ReplayLog, ReplayRun, ReplaySummary};
 use crate::report::charts::map::{self, MapPoint};
 use crate::simulator::DriveSummary;
 use crate::simulator::trial::statistics::wilson_interval;
 use crate::simulator::trial::trajectory::SUMMARY;
 
-const MPH_PER_MPS: f64 = 1.0 / 0.447_04;
 /// Size of a map, pixels.
 const MAP: [f64; 2] = [760.0, 620.0];
 

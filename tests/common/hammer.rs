@@ -113,7 +113,7 @@ pub struct Hammer {
 }
 
 impl Hammer {
-    /// Reads damaged versions of `original` for `share` of the time, and prints what happened.
+    /// Reads damaged versions of `original` for `seconds`, or for `STEERSMAN_FUZZ_SECONDS`, and prints what happened.
     ///
     /// # Panics
     ///
@@ -122,16 +122,16 @@ impl Hammer {
         &self,
         name: &str,
         original: &T,
-        share: f64,
+        seconds: f64,
         damage: impl Fn(&mut ChaCha8Rng, &mut T),
         read: impl Fn(&T) -> Result<(), String>,
     ) {
-        let seconds = number("STEERSMAN_FUZZ_SECONDS", 4.0);
+        let seconds = number("STEERSMAN_FUZZ_SECONDS", seconds);
         let first = number("STEERSMAN_FUZZ_SEED", 1u64);
         let (mut accepted, mut refused, mut slowest) = (0, 0, Duration::ZERO);
         read(original).unwrap_or_else(|e| panic!("{name}: the undamaged one is refused: {e}"));
         let clock = Instant::now();
-        let end = clock + Duration::from_secs_f64(seconds * share);
+        let end = clock + Duration::from_secs_f64(seconds);
         // When the read that is under way began, in ms; 0 between two.
         let began_ms = AtomicU64::new(0);
         let done = std::sync::mpsc::channel::<()>();

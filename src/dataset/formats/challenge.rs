@@ -99,15 +99,11 @@ fn read(store: &Store, path: &Path, rows: &mut Rows) -> Result<()> {
                     camera if camera.starts_with("left") => sides[0].push((time_ms, file)),
                     camera if camera.starts_with("right") => sides[1].push((time_ms, file)),
                     _ => centre.push(Entry {
-                        taken_over: false,
-                        line: 0,
                         images: [Some(file), None, None],
                         steering,
-                        throttle: f32::NAN,
-                        brake: f32::NAN,
                         speed_mph: speed_mph as f32,
                         time_ms: Some(time_ms),
-                        source: String::new(),
+                        ..Entry::at(number)
                     }),
                 }
                 Ok(())
@@ -115,9 +111,7 @@ fn read(store: &Store, path: &Path, rows: &mut Rows) -> Result<()> {
             None => Err(format!("no row of {} fields with a time and an angle", header.len())),
         };
         match line {
-            Ok(()) => {
-                centre.last_mut().into_iter().filter(|entry| entry.line == 0).for_each(|entry| entry.line = number)
-            }
+            Ok(()) => {}
             Err(detail) => rows.unusable(number, Reason::NotANumber, &detail),
         }
     }
@@ -156,15 +150,10 @@ fn read_frames(store: &Store, path: &Path, rows: &mut Rows) -> Result<()> {
                 let is_png = places.iter().any(|place| store.is_file(&place.join(&png)));
                 let time_ms = time_ms(&id);
                 rows.push(Entry {
-                    taken_over: false,
-                    line: number,
                     images: [Some(if is_png { png } else { format!("{id}.jpg") }), None, None],
                     steering,
-                    throttle: f32::NAN,
-                    brake: f32::NAN,
-                    speed_mph: f32::NAN,
                     time_ms,
-                    source: String::new(),
+                    ..Entry::at(number)
                 })?;
             }
             _ if id.is_empty() => {}

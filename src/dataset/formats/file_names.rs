@@ -6,7 +6,7 @@ use super::Format;
 use crate::dataset::description::Unit;
 use crate::dataset::pictures::files::is_picture_name;
 use crate::dataset::recording::file_name;
-use crate::dataset::rows::{Entry, Rows};
+use crate::dataset::rows::{Entry, NO_NUMBER, Rows};
 use crate::dataset::store::Store;
 use crate::dataset::unusable::Reason;
 use crate::{Error, Result};
@@ -125,15 +125,12 @@ fn read(store: &Store, folder: &Path, rows: &mut Rows) -> Result<()> {
         let time_ms = super::udacity::time_of(&name);
         match style.label(&name) {
             Some(steering) => rows.push(Entry {
-                taken_over: false,
-                line,
+                // Its place among the names changes with the files there.
+                number: NO_NUMBER,
                 images: [Some(name), None, None],
                 steering,
-                throttle: f32::NAN,
-                brake: f32::NAN,
-                speed_mph: f32::NAN,
                 time_ms,
-                source: String::new(),
+                ..Entry::at(line)
             })?,
             None => rows.unusable(line, Reason::NotANumber, &format!("{name} carries no label")),
         }

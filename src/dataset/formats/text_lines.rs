@@ -109,17 +109,7 @@ fn read(store: &Store, path: &Path, rows: &mut Rows) -> Result<()> {
     }
     for (line, Parsed { file, angle, time_ms }) in parsed {
         let source = split_path(&file).0.to_owned();
-        rows.push(Entry {
-            taken_over: false,
-            line,
-            images: [Some(file), None, None],
-            steering: angle,
-            throttle: f32::NAN,
-            brake: f32::NAN,
-            speed_mph: f32::NAN,
-            time_ms,
-            source,
-        })?;
+        rows.push(Entry { images: [Some(file), None, None], steering: angle, time_ms, source, ..Entry::at(line) })?;
     }
     Ok(())
 }

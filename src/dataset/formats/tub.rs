@@ -8,9 +8,9 @@ use serde::Deserialize;
 use serde_json::Value;
 
 use super::{Format, parent};
-use crate::dataset::description::{Labels, Unit};
+use crate::dataset::description::{DESCRIPTION_FILE, Labels, Unit};
 use crate::dataset::recording::file_name;
-use crate::dataset::rows::{Entry, Rows};
+use crate::dataset::rows::{Entry, NO_NUMBER, Rows};
 use crate::dataset::store::Store;
 use crate::dataset::unusable::Reason;
 use crate::{Error, Result};
@@ -79,6 +79,13 @@ pub(super) struct Counts {
 }
 
 impl Counts {
+    /// Whether the next record is read; one that is marked as deleted is counted instead, unless such rows are asked for.
+    pub fn keep(&mut self, deleted: bool, rows: &mut Rows) -> bool {
+        let keep = !deleted || rows.keeps_excluded();
+        self.deleted += usize::from(!keep);
+        keep
+    }
+
     /// Says what was left out.
     pub fn report(&self, labels: Labels, rows: &mut Rows) {
         if self.deleted > 0 {
@@ -96,8 +103,9 @@ impl Counts {
     }
 }
 
-/// Hands the row of `record` to `rows`.
-pub(super) fn push(record: Record, line: u32, labels: Labels, counts: &mut Counts, rows: &mut Rows) -> Result<()> {
+/// Hands the row of `record` to `rows`. `place` says its line, its number and whether it is marked as deleted.
+pub(super) fn push(record: Record, place: Entry, labels: Labels, counts: &mut Counts, rows: &mut Rows) -> Result<()> {
+    let line = place.line;
     if record.empty == Some(true) {
         counts.deleted += 1;
         return Ok(());
@@ -125,15 +133,12 @@ pub(super) fn push(record: Record, line: u32, labels: Labels, counts: &mut Count
     // Times beyond the year 9999 are no times.
     let time_ms = record.time_ms.as_ref().and_then(|time| time.as_i64().or(time.as_f64().map(|time| time as i64)));
     rows.push(Entry {
-        taken_over: false,
-        line,
         images: [Some(image), None, None],
         steering,
         throttle: throttle.map_or(f32::NAN, |x| x as f32),
-        brake: f32::NAN,
-        speed_mph: f32::NAN,
         time_ms: time_ms.filter(|ms| (0..=253_402_300_799_999).contains(ms)),
         source: record.session.unwrap_or_default(),
+        ..place
     })
 }
 
@@ -143,6 +148,14 @@ fn find(store: &Store, path: &Path) -> Result<Option<PathBuf>> {
     }
     let catalogs = || Ok::<bool, Error>(!catalogs(store, path)?.is_empty());
     Ok((store.is_file(&path.join("manifest.json")) || catalogs()?).then(|| path.to_path_buf()))
+}
+
+/// Checks that nothing but the tub itself leaves records out.
+pub(super) fn require_own_list(rows: &Rows, folder: &Path, list: &str) -> Result<()> {
+    if rows.said().exclude.is_empty() {
+        return Ok(());
+    }
+    Err(Error::data(folder.join(DESCRIPTION_FILE), format!("exclude: a tub has a list of its own for that, {list}")))
 }
 
 /// The catalogs that lie in `folder`, by their numbers.
@@ -196,6 +209,7 @@ fn contents(store: &Store, folder: &Path, rows: &mut Rows) -> Result<(Vec<String
 }
 
 fn read(store: &Store, folder: &Path, rows: &mut Rows) -> Result<()> {
+    require_own_list(rows, folder, "the deleted_indexes of its manifest.json")?;
     let labels = rows.said().labels.unwrap_or_default();
     let (paths, deleted) = contents(store, folder, rows)?;
     let mut counts = Counts::default();
@@ -230,8 +244,13 @@ fn read(store: &Store, folder: &Path, rows: &mut Rows) -> Result<()> {
                 continue;
             }
             match serde_json::from_slice::<Record>(&text) {
-                Ok(record) if record.index.is_some_and(|index| deleted.contains(&index)) => counts.deleted += 1,
-                Ok(record) => push(record, line, labels, &mut counts, rows)?,
+                Ok(record) => {
+                    let excluded = record.index.is_some_and(|index| deleted.contains(&index));
+                    let number = record.index.and_then(|index| u32::try_from(index).ok()).unwrap_or(NO_NUMBER);
+                    if counts.keep(excluded, rows) {
+                        push(record, Entry { number, excluded, ..Entry::at(line) }, labels, &mut counts, rows)?;
+                    }
+                }
                 Err(error) => rows.unusable(line, Reason::NotANumber, &format!("the record cannot be read: {error}")),
             }
         }

@@ -3,11 +3,11 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use super::tub::{Counts, Record, push};
+use super::tub::{Counts, Record, push, require_own_list};
 use super::{Format, parent};
 use crate::dataset::description::Unit;
 use crate::dataset::recording::file_name;
-use crate::dataset::rows::Rows;
+use crate::dataset::rows::{Entry, Rows};
 use crate::dataset::store::Store;
 use crate::dataset::unusable::Reason;
 use crate::{Error, Result};
@@ -42,6 +42,7 @@ fn find(store: &Store, path: &Path) -> Result<Option<PathBuf>> {
 }
 
 fn read(store: &Store, folder: &Path, rows: &mut Rows) -> Result<()> {
+    require_own_list(rows, folder, "exclude.json")?;
     let labels = rows.said().labels.unwrap_or_default();
     let mut numbers: Vec<u32> = store.list(folder)?.iter().filter_map(|path| number(&file_name(path))).collect();
     numbers.sort_unstable();
@@ -57,8 +58,8 @@ fn read(store: &Store, folder: &Path, rows: &mut Rows) -> Result<()> {
     let mut counts = Counts::default();
     rows.read_from("record_N.json");
     for number in numbers {
-        if excluded_numbers.contains(&number) {
-            counts.deleted += 1;
+        let excluded = excluded_numbers.contains(&number);
+        if !counts.keep(excluded, rows) {
             continue;
         }
         let path = folder.join(format!("record_{number}.json"));
@@ -67,7 +68,7 @@ fn read(store: &Store, folder: &Path, rows: &mut Rows) -> Result<()> {
             serde_json::from_str::<Record>(&text).map_err(|error| format!("the record cannot be read: {error}"))
         });
         match record {
-            Ok(record) => push(record, number, labels, &mut counts, rows)?,
+            Ok(record) => push(record, Entry { excluded, ..Entry::at(number) }, labels, &mut counts, rows)?,
             Err(detail) => rows.unusable(number, Reason::NotANumber, &detail),
         }
     }

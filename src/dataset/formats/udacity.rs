@@ -317,15 +317,12 @@ fn number(field: &str, decimal_comma: bool, name: &str) -> Result<f64, Fault> {
 fn entry(line: u32, images: [Option<String>; 3], values: [f64; 4]) -> Entry {
     let [steering, throttle, brake, speed_mph] = values;
     Entry {
-        taken_over: false,
-        line,
         images,
         steering,
         throttle: throttle as f32,
         brake: brake as f32,
         speed_mph: speed_mph as f32,
-        time_ms: None,
-        source: String::new(),
+        ..Entry::at(line)
     }
 }
 
@@ -448,7 +445,7 @@ mod tests {
         let Line::Row(entry) = &lines(&format!("{header}\nc.jpg,l.jpg,r.jpg,-0.25,0.5,0,9.5,3,12.5"))[0] else {
             panic!()
         };
-        assert_eq!(Entry { line: 1, ..entry.clone() }, plain);
+        assert_eq!(Entry { line: 1, number: 1, ..entry.clone() }, plain);
     }
 
     #[test]

@@ -29,9 +29,8 @@ pub fn write_row(
     writeln!(out, "{steering}{separator}{throttle}{separator}{brake}{separator}{speed_mph}")
 }
 
-/// Name of a picture of `camera` (`center`, `left` or `right`) that was taken `time_ms` milliseconds after 1970, UTC.
-pub fn picture_name(camera: &str, time_ms: u64) -> String {
-    let time_ms = if time_ms < YEAR_10000_MS { time_ms } else { time_ms % 1000 };
+/// Year, month, day, hour, minute and second, UTC, of `time_ms` milliseconds after 1970.
+pub(crate) fn civil(time_ms: u64) -> [u64; 6] {
     // The civil calendar from days, counting years from March so that the leap day comes last (H. Hinnant).
     let days = time_ms / 86_400_000 + 719_468;
     let (era, day_of_era) = (days / 146_097, days % 146_097);
@@ -41,8 +40,14 @@ pub fn picture_name(camera: &str, time_ms: u64) -> String {
     let day = day_of_year - (153 * from_march + 2) / 5 + 1;
     let month = if from_march < 10 { from_march + 3 } else { from_march - 9 };
     let year = 400 * era + year_of_era + u64::from(month <= 2);
-    let (hour, minute) = (time_ms / 3_600_000 % 24, time_ms / 60_000 % 60);
-    let (second, ms) = (time_ms / 1000 % 60, time_ms % 1000);
+    [year, month, day, time_ms / 3_600_000 % 24, time_ms / 60_000 % 60, time_ms / 1000 % 60]
+}
+
+/// Name of a picture of `camera` (`center`, `left` or `right`) that was taken `time_ms` milliseconds after 1970, UTC.
+pub fn picture_name(camera: &str, time_ms: u64) -> String {
+    let time_ms = if time_ms < YEAR_10000_MS { time_ms } else { time_ms % 1000 };
+    let [year, month, day, hour, minute, second] = civil(time_ms);
+    let ms = time_ms % 1000;
     format!("{camera}_{year:04}_{month:02}_{day:02}_{hour:02}_{minute:02}_{second:02}_{ms:03}.jpg")
 }
 

@@ -10,14 +10,13 @@ use super::suspicious::{self, STANDING_MPH};
 use super::{FULL_LOCK, STRAIGHT, Treatment, advice};
 use crate::dataset::recording::{Recording, Row, View};
 use crate::dataset::unusable::{Reason, Unusable};
+use crate::geometry::MPS_PER_MPH;
 use crate::text::escaped;
 
 /// Steering bins of width 0.1, centred at -1.0, -0.9, … 1.0.
 const BINS: usize = 21;
 /// A step between rows of a session that is this many times the usual one is a gap.
 const GAP_STEPS: f64 = 3.0;
-/// Metres per second in a mile per hour.
-const MPS_PER_MPH: f64 = 0.44704;
 
 /// The findings about `recording` at `path`, whose centre pictures are `frames`; with advice for training that does what
 /// `treatment` says.

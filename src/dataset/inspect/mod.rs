@@ -79,6 +79,15 @@ pub fn inspect(
     Ok(Inspection { recording: checked, frames, report })
 }
 
+/// The suspicious stretches of `recording`, for which it looks at its pictures.
+///
+/// # Errors
+/// The observer's own.
+pub(crate) fn stretches(recording: &Recording, observer: &mut (dyn Observer<Progress> + Send)) -> Result<Vec<Stretch>> {
+    let frames = frames::look(recording, observer)?;
+    Ok(suspicious::find(recording, &frames, Lag::of(recording, &frames)))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -5,10 +5,12 @@ use std::path::PathBuf;
 
 use super::drives::{self, DriveView};
 use super::html::Page;
+use super::run_list;
 use crate::error::{Error, Result};
 use crate::recipe::Recipe;
 use crate::report::charts::chart::{Axis, Chart, Mark};
 use crate::report::charts::palette;
+use crate::report::tone::Tone;
 use crate::training::{EpochRecord, RunFolder, TrainResult};
 use steersman_kernels::Isa;
 
@@ -22,9 +24,20 @@ pub struct RunView {
     pub name: String,
     recipe: Recipe,
     seed: u64,
+    /// What it was trained on.
+    data: Data,
     history: Vec<EpochRecord>,
     result: Option<TrainResult>,
     drives: Vec<DriveView>,
+}
+
+/// What a run was trained on.
+#[derive(Debug, Default, PartialEq)]
+struct Data {
+    /// Names of the recordings, for people.
+    names: String,
+    /// Hash over the rows of both sides.
+    rows_hash: String,
 }
 
 /// Reads the runs in `folders`.
@@ -36,10 +49,12 @@ pub fn read(folders: &[PathBuf]) -> Result<Vec<RunView>> {
     let names = names(folders);
     let read = |(path, name): (&PathBuf, String)| {
         let folder = RunFolder::open(path)?;
+        let info = folder.info()?;
         Ok(RunView {
             name,
             recipe: folder.recipe()?,
-            seed: folder.info()?.seed,
+            seed: info.seed,
+            data: Data { names: run_list::recordings(&info.recordings), rows_hash: info.rows_hash },
             history: if folder.file("history.csv").is_file() { folder.history()? } else { Vec::new() },
             result: folder.result()?,
             drives: drives::read(path)?,
@@ -66,7 +81,15 @@ pub fn page(runs: &[RunView]) -> Result<String> {
     let mut page = Page::new("Runs compared", &names.join(", "));
     figures(&mut page, runs)?;
     page.section("Learning curves");
-    page.drawings(&curves(runs));
+    let same_data = runs.iter().all(|run| run.data.rows_hash == runs[0].data.rows_hash);
+    if !same_data {
+        page.advice(
+            "These runs were trained on different rows (other recordings, another split, other cameras). Each has its own validation \
+             curve below: one says nothing about the other. Drives can be compared.",
+            Tone::Warning,
+        );
+    }
+    page.drawings(&curves(runs, same_data));
     page.section("What their recipes differ in");
     let (keys, rows) = differences(runs)?;
     if rows.is_empty() {
@@ -95,6 +118,7 @@ fn figures(page: &mut Page, runs: &[RunView]) -> Result<()> {
         rows.push(vec![
             run.name.clone(),
             run.recipe.name.clone(),
+            run.data.names.clone(),
             run.seed.to_string(),
             crate::engine::network::group_digits(network.count(true) as u64),
             format!("{}{}", run.history.len(), if run.result.is_some() { "" } else { " (unfinished)" }),
@@ -110,6 +134,7 @@ fn figures(page: &mut Page, runs: &[RunView]) -> Result<()> {
     let headers = [
         "run",
         "recipe",
+        "trained on",
         "seed",
         "trainable",
         "epochs",
@@ -122,28 +147,34 @@ fn figures(page: &mut Page, runs: &[RunView]) -> Result<()> {
         "seconds",
     ];
     page.table(&headers, &rows);
-    page.paragraph("Validation errors of runs on different recordings, or with another split or camera choice, cannot be compared.");
     Ok(())
 }
 
-fn curves(runs: &[RunView]) -> Vec<String> {
-    let chart = |title: &str, axis: Axis, value: fn(&EpochRecord) -> Option<f64>| {
-        runs.iter().enumerate().fold(Chart::new(title, HALF, Axis::new("epoch"), axis), |chart, (i, run)| {
+/// The curves of all runs; those of the validation error apart where the runs do not have the same data.
+fn curves(runs: &[RunView], same_data: bool) -> Vec<String> {
+    let chart = |title: &str, axis: Axis, shown: &[(usize, &RunView)], value: fn(&EpochRecord) -> Option<f64>| {
+        shown.iter().fold(Chart::new(title, HALF, Axis::new("epoch"), axis), |chart, (i, run)| {
             let points =
                 run.history.iter().filter_map(|record| Some([f64::from(record.epoch), value(record)?])).collect();
-            chart.add(&run.name, palette::series(i), Mark::Line(2.0), points)
+            chart.add(&run.name, palette::series(*i), Mark::Line(2.0), points)
         })
     };
+    let all: Vec<(usize, &RunView)> = runs.iter().enumerate().collect();
+    // On one axis only what can be compared.
+    let groups: Vec<&[(usize, &RunView)]> = if same_data { vec![&all] } else { all.chunks(1).collect() };
+    let title = |what: &str, group: &[(usize, &RunView)]| match group {
+        [(_, run)] if !same_data => format!("{what}, {} on {}", run.name, run.data.names),
+        _ => what.into(),
+    };
     let loss = || Axis::new("squared error").log();
-    [
-        chart("Training loss", loss(), |record| Some(record.train_loss)),
-        chart("Validation MSE", loss(), |record| record.val_mse),
-        chart("Mean absolute error, centre camera", Axis::new("degrees"), |record| record.val_mae_deg),
-        chart("Learning rate", Axis::new("learning rate"), |record| Some(record.learning_rate)),
-    ]
-    .iter()
-    .map(Chart::draw)
-    .collect()
+    let mut charts = vec![chart("Training loss", loss(), &all, |record| Some(record.train_loss))];
+    for group in groups {
+        charts.push(chart(&title("Validation MSE", group), loss(), group, |record| record.val_mse));
+        let what = title("Mean absolute error, centre camera", group);
+        charts.push(chart(&what, Axis::new("degrees"), group, |record| record.val_mae_deg));
+    }
+    charts.push(chart("Learning rate", Axis::new("learning rate"), &all, |record| Some(record.learning_rate)));
+    charts.iter().map(Chart::draw).collect()
 }
 
 /// The entries that differ between the recipes, with the value in each run.
@@ -221,7 +252,15 @@ mod tests {
     fn run(name: &str, overrides: &[&str]) -> RunView {
         let overrides: Vec<String> = overrides.iter().map(|text| text.to_string()).collect();
         let recipe = Recipe::find("lenet", &overrides).unwrap();
-        RunView { name: name.into(), recipe, seed: 1, history: Vec::new(), result: None, drives: Vec::new() }
+        RunView {
+            name: name.into(),
+            recipe,
+            seed: 1,
+            data: Data::default(),
+            history: Vec::new(),
+            result: None,
+            drives: Vec::new(),
+        }
     }
 
     #[test]
@@ -244,6 +283,22 @@ mod tests {
     fn runs_without_epochs_or_drives_have_a_page() {
         let text = page(&[run("a", &[]), run("b", &[])]).unwrap();
         crate::report::pages::html::assert_stands_alone(&text);
-        assert!(text.contains("(unfinished)") && text.contains("No drives"));
+        assert!(text.contains("(unfinished)") && text.contains("No drives") && !text.contains("different rows"));
+    }
+
+    #[test]
+    fn runs_on_different_data_share_no_validation_axis() {
+        let on = |name: &str, data: &str| {
+            let data = Data { names: data.into(), rows_hash: data.into() };
+            RunView { data, ..run(name, &[]) }
+        };
+        let text = page(&[on("a", "lake"), on("b", "coast")]).unwrap();
+        crate::report::pages::html::assert_stands_alone(&text);
+        assert!(text.contains("trained on different rows"));
+        assert!(text.contains("Validation MSE, a on lake") && text.contains("Validation MSE, b on coast"));
+        assert!(
+            page(&[on("a", "lake"), on("b", "lake")]).unwrap().matches("Validation MSE").count()
+                < text.matches("Validation MSE").count()
+        );
     }
 }

@@ -8,9 +8,8 @@ use super::onlooker::Onlooker;
 use super::painter::{Captions, FilmFrame, FilmScales, Painter};
 use super::summary::VideoSummary;
 use crate::error::Result;
+use crate::geometry::MPH_PER_MPS;
 use crate::replay::{DRIVE_HZ, ReplayFrame, ReplayLog, ReplayRun};
-
-const MPH_PER_MPS: f64 = 1.0 / 0.447_04;
 
 /// The video of a drive along one session, begun.
 pub struct ReplayVideo {

@@ -16,7 +16,7 @@ pub const REAR_AXLE_M: f64 = 1.60;
 pub const HALF_TRACK_M: f64 = 1.0;
 /// Angle of the front wheels at steering 1, deg.
 pub const MAX_STEER_DEG: f64 = 25.0;
-/// Metres a second in a mile an hour.
+/// Metres a second in a mile an hour, as Udacity's simulator rounds it.
 pub const MPS_PER_MPH: f64 = 1.0 / 2.236_936_29;
 /// Top speed, m/s (30 mph).
 pub const TOP_SPEED_MPS: f64 = 30.0 * MPS_PER_MPH;

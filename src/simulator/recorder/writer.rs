@@ -1,7 +1,7 @@
 //! The files of a recording: pictures, the log's lines, and a writer that adds one row after the other.
 
 use std::fs::{self, File};
-use std::io::{self, Write as _};
+use std::io::{self, Seek as _, SeekFrom, Write as _};
 use std::path::{Path, PathBuf};
 
 use crate::dataset::udacity_writer::{HEADER, picture_name, write_row};
@@ -95,6 +95,8 @@ pub struct RowWriter<'a> {
     file: File,
     /// Bytes of whole lines.
     len: u64,
+    /// Time, s, and begin in the log of each row.
+    rows: Vec<(f64, u64)>,
     text: Vec<u8>,
 }
 
@@ -121,6 +123,7 @@ impl<'a> RowWriter<'a> {
             lines,
             log,
             file,
+            rows: Vec::new(),
             text: Vec::new(),
         })
     }
@@ -138,7 +141,31 @@ impl<'a> RowWriter<'a> {
             let _ = self.file.set_len(self.len);
             return Err(Error::Io { path: self.log.clone(), source });
         }
+        self.rows.push((sample.time_s, self.len));
         self.len += self.text.len() as u64;
+        Ok(())
+    }
+
+    /// Number of rows.
+    pub fn rows(&self) -> usize {
+        self.rows.len()
+    }
+
+    /// Takes all rows behind the first `rows` out of the log, and then their pictures.
+    ///
+    /// # Errors
+    /// If something cannot be changed. No row of the log is without its pictures.
+    pub fn keep(&mut self, rows: usize) -> Result<()> {
+        let Some(&(_, len)) = self.rows.get(rows) else { return Ok(()) };
+        let shortened = self.file.set_len(len).and_then(|()| self.file.seek(SeekFrom::Start(len)));
+        shortened.map_err(Error::io(&self.log))?;
+        self.len = len;
+        for (time_s, _) in self.rows.drain(rows..) {
+            for mount in Mount::ALL {
+                let path = self.images.join(image_name(mount, time_s));
+                fs::remove_file(&path).map_err(Error::io(&path))?;
+            }
+        }
         Ok(())
     }
 }
