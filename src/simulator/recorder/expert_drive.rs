@@ -218,8 +218,8 @@ mod tests {
             let squares = |samples: &[Sample]| samples.iter().map(|s| s.steering * s.steering).sum::<f64>();
             if recovery {
                 // Twice as far ahead as the expert's own 6.13 m, a place beside the line asks for a quarter of the steering and a
-                // turn for half of it.
-                assert!(squares(&far) < 0.25 * squares(&near), "{} {}", squares(&far), squares(&near));
+                // turn for half of it; bends ask for as much.
+                assert!(squares(&far) < 0.4 * squares(&near), "{} {}", squares(&far), squares(&near));
             } else {
                 // On the line both ask for the bend.
                 assert!((squares(&far) / squares(&near) - 1.0).abs() < 0.2, "{} {}", squares(&far), squares(&near));
