@@ -62,9 +62,9 @@
 //! # */
 //! // The recipe is the experiment: preprocessing, network, split, optimizer. A path ending in .toml names one of your own.
 //! let recipe = Recipe::find("lenet", &["epochs=2".into(), "batch=16".into()])?;
-//! let (recordings, validate, also) = (vec!["data/sample".into()], vec![], vec![]);
+//! let (recordings, validate, also, simulator) = (vec!["data/sample".into()], vec![], vec![], vec![]);
 //! let (said, from, algorithm, profile) = (Description::default(), None, None, false);
-//! let request = TrainRequest { recordings, validate, also, said, recipe, out, seed: 1, cache_mib: 64, from, algorithm, profile };
+//! let request = TrainRequest { recordings, validate, also, simulator, said, recipe, out, seed: 1, cache_mib: 64, from, algorithm, profile };
 //! let stop = StopSignal::default(); // requested from elsewhere, it ends the run after the current batch
 //! let mut observer = |event| {
 //!     match event {

@@ -89,6 +89,47 @@ impl Metrics {
     }
 }
 
+/// Measures of an output beside the steering, in the unit of its pairs. A mean over nothing is `None`.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct OutputMetrics {
+    /// Number of rows.
+    pub rows: usize,
+    /// Mean absolute error.
+    pub mae: f64,
+    /// Root of the mean squared error.
+    pub rmse: f64,
+    /// Mean of prediction − label.
+    pub bias: f64,
+    /// Mean of the labels.
+    pub label_mean: f64,
+    /// Share of the labels' variance that is explained: 0 is as good as always predicting their mean.
+    pub r2: Option<f64>,
+    /// Pearson's correlation of predictions and labels.
+    pub correlation: Option<f64>,
+}
+
+impl OutputMetrics {
+    /// The measures of `pairs` of prediction and label; `None` if there are none.
+    pub fn of(pairs: &[(f64, f64)]) -> Option<OutputMetrics> {
+        let count = pairs.len() as f64;
+        let mean = |of: &dyn Fn(f64, f64) -> f64| {
+            pairs.iter().map(|(prediction, label)| of(*prediction, *label)).sum::<f64>() / count
+        };
+        let mse = mean(&|prediction, label| (prediction - label).powi(2));
+        let label_mean = mean(&|_, label| label);
+        let label_variance = mean(&|_, label| (label - label_mean).powi(2));
+        (!pairs.is_empty()).then(|| OutputMetrics {
+            rows: pairs.len(),
+            mae: mean(&|prediction, label| (prediction - label).abs()),
+            rmse: mse.sqrt(),
+            bias: mean(&|prediction, label| prediction - label),
+            label_mean,
+            r2: (label_variance > 0.0).then(|| 1.0 - mse / label_variance),
+            correlation: correlation(pairs.iter().copied()),
+        })
+    }
+}
+
 /// Pearson's correlation of pairs; absent where one side is always the same, or there are no pairs.
 pub fn correlation(pairs: impl Iterator<Item = (f64, f64)> + Clone) -> Option<f64> {
     let count = pairs.clone().count() as f64;
@@ -139,6 +180,18 @@ mod tests {
             ((55f64.powi(2) + 95f64.powi(2)) / 2.0).sqrt(),
             max_relative = 1e-5
         );
+    }
+
+    #[test]
+    fn the_measures_of_another_output_have_their_definitions() {
+        let m = OutputMetrics::of(&[(0.5, 0.25), (0.5, 1.0), (0.0, 0.25)]).unwrap();
+        assert_eq!((m.rows, m.mae, m.label_mean), (3, 1.0 / 3.0, 0.5));
+        assert_relative_eq!(m.rmse, (0.375f64 / 3.0).sqrt());
+        assert_relative_eq!(m.bias, -0.5 / 3.0);
+        assert_relative_eq!(m.r2.unwrap(), 1.0 - 0.125 / 0.125);
+        assert_relative_eq!(m.correlation.unwrap(), 0.5);
+        assert_eq!(OutputMetrics::of(&[]), None);
+        assert_eq!(OutputMetrics::of(&[(1.0, 0.5)]).unwrap().r2, None);
     }
 
     #[test]

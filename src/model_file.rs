@@ -1,7 +1,8 @@
 //! The model file: one [safetensors](https://huggingface.co/docs/safetensors) file with everything a model needs to drive.
 //!
 //! Tensors carry the names of the network (`conv1.weight`, `bn1.running_mean`; see [`Network::tensors`]). The metadata has one
-//! entry, `steersman`, a JSON object: `format` (a number), `label`, `recipe` (network, preprocessing and all the rest) and
+//! entry, `steersman`, a JSON object: `format` (a number), `label` (what the outputs mean), `recipe` (outputs by their names, network,
+//! preprocessing and all the rest) and
 //! `training` (the [`TrainingRecord`]). One more tensor, `training_rows`, says which rows the model was trained on.
 
 use std::collections::HashMap;
@@ -22,9 +23,6 @@ use crate::recipe::Recipe;
 const FORMAT: u32 = 1;
 const METADATA_KEY: &str = "steersman";
 const TRAINING_ROWS: &str = "training_rows";
-/// The meaning of the output of a model.
-pub(crate) const LABEL: &str =
-    "steering in [-1, 1], positive to the right; times recipe.full_lock_deg it is degrees of the front wheels";
 
 /// A trained network: recipe, parameters, and the record of its training.
 #[derive(Clone, Debug, PartialEq)]
@@ -102,7 +100,7 @@ impl Model {
         let network = self.recipe.network(Isa::PORTABLE)?;
         let metadata = Metadata {
             format: FORMAT,
-            label: LABEL.into(),
+            label: self.recipe.outputs.label(),
             recipe: self.recipe.clone(),
             training: self.record.clone(),
         };

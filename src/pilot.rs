@@ -1,12 +1,13 @@
-//! A trained model at the wheel: image in, steering out.
+//! A trained model at the wheel: image in, steering out, and throttle or speed of models that give one.
 
 use std::path::Path;
 use std::sync::Arc;
 
-use ndarray::{Array1, ArrayView3, ArrayView4, ArrayViewD, ArrayViewMut1, Axis};
+use ndarray::{Array1, Array2, ArrayView3, ArrayView4, ArrayViewD, ArrayViewMut1, Axis};
 use rayon::prelude::*;
 use steersman_kernels::Isa;
 
+use crate::dataset::OutputKind;
 use crate::dataset::preprocess::Preprocessor;
 use crate::engine::network::{Network, ObservationPlan, Parameters, Predictor};
 use crate::error::{Error, Result};
@@ -17,6 +18,18 @@ use crate::picture::{
     decode::{MAX_FILE_LEN, MAX_SIDE, decode_rgb_within},
 };
 use crate::recipe::Recipe;
+
+/// What a model answers for an image.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Answer {
+    /// Steering: roughly in [−1, 1], positive to the right; not clamped.
+    pub steering: f32,
+    /// Throttle: roughly in [−1, 1], negative to brake; not clamped. Of models with such an output.
+    pub throttle: Option<f32>,
+    /// Speed to drive at, as a share of [`Outputs::top_speed_mph`](crate::dataset::Outputs::top_speed_mph); not clamped. Of models with
+    /// such an output.
+    pub speed: Option<f32>,
+}
 
 /// A model that predicts the steering of one image after the other on the calling thread.
 ///
@@ -48,6 +61,8 @@ pub struct Pilot {
     planes: Vec<u8>,
     /// Input of the network.
     input: Vec<f32>,
+    /// Outputs of the network.
+    outputs: Vec<f32>,
 }
 
 /// What the clones of a pilot share beside the network.
@@ -85,6 +100,7 @@ impl Pilot {
             planes: vec![0; recipe.preprocessing.output_len()],
             input: vec![0.0; recipe.preprocessing.output_len()],
             pixels: Vec::new(),
+            outputs: vec![0.0; recipe.outputs.count()],
             about: Arc::new(About { recipe, trained_on_held_out }),
         })
     }
@@ -124,12 +140,26 @@ impl Pilot {
     ///
     /// [`Error::Input`] if the image has no pixels, or not three colours.
     pub fn steer(&mut self, image: ArrayView3<u8>) -> Result<f32> {
+        Ok(self.answer(image)?.steering)
+    }
+
+    /// All that the model answers for an RGB image; see [`steer`](Self::steer).
+    ///
+    /// # Errors
+    ///
+    /// As [`steer`](Self::steer).
+    pub fn answer(&mut self, image: ArrayView3<u8>) -> Result<Answer> {
         self.preprocess(image)?;
-        let mut steering = [0.0];
         let input = ArrayView4::from_shape(self.predictor.network().input().batch(1), &self.input);
         let input = input.expect("preprocessing gives an image of the network's input shape");
-        self.predictor.run(input, ArrayViewMut1::from(&mut steering));
-        Ok(steering[0])
+        self.predictor.run(input, ArrayViewMut1::from(&mut self.outputs));
+        Ok(self.last_answer())
+    }
+
+    /// The outputs of the last call by their names.
+    fn last_answer(&self) -> Answer {
+        let output = |kind| self.about.recipe.outputs.index(kind).map(|index| self.outputs[index]);
+        Answer { steering: self.outputs[0], throttle: output(OutputKind::Throttle), speed: output(OutputKind::Speed) }
     }
 
     /// Steering for each of `images`, `(n, height, width, 3)`; the images are shared out over the rayon pool. The bits are those of
@@ -144,6 +174,28 @@ impl Pilot {
         Ok(Array1::from(steering.collect::<Result<Vec<f32>>>()?))
     }
 
+    /// All outputs for each of `images`, `(n, height, width, 3)`, as `(n, outputs)` in the order of the recipe's `outputs`.
+    ///
+    /// # Errors
+    ///
+    /// As [`steer`](Self::steer).
+    pub fn predict_outputs(&self, images: ArrayView4<u8>) -> Result<Array2<f32>> {
+        let (n, outputs) = (images.len_of(Axis(0)), self.outputs.len());
+        let mut all = Array2::zeros((n, outputs));
+        let rows = all.as_slice_mut().expect("a new array is in standard order").par_chunks_exact_mut(outputs);
+        rows.enumerate()
+            .map_init(
+                || self.clone(),
+                |pilot, (index, row)| {
+                    pilot.answer(images.index_axis(Axis(0), index))?;
+                    row.copy_from_slice(&pilot.outputs);
+                    Ok(())
+                },
+            )
+            .collect::<Result<()>>()?;
+        Ok(all)
+    }
+
     /// [`steer`](Self::steer) that calls `seen` with the index in [`Network::layers`] and the output, `[c][h][w]`, of each layer that
     /// computes something.
     ///
@@ -153,10 +205,9 @@ impl Pilot {
     pub fn steer_observed(&mut self, image: ArrayView3<u8>, seen: &mut dyn FnMut(usize, &[f32])) -> Result<f32> {
         self.preprocess(image)?;
         let (network, parameters) = (self.predictor.network(), self.predictor.parameters());
-        let mut steering = [0.0];
         let plan = self.observation.get_or_insert_with(|| ObservationPlan::new(network));
-        plan.run(network, parameters, &self.input, &mut steering, seen);
-        Ok(steering[0])
+        plan.run(network, parameters, &self.input, &mut self.outputs, seen);
+        Ok(self.outputs[0])
     }
 
     /// Writes the network's input for an RGB image.
@@ -197,13 +248,22 @@ impl Pilot {
     ///
     /// As [`Pilot::steer_encoded`].
     pub fn steer_encoded_within(&mut self, bytes: &[u8], max_side: usize) -> Result<f32> {
+        Ok(self.answer_encoded_within(bytes, max_side)?.steering)
+    }
+
+    /// All that the model answers for a JPEG or PNG image of at most `max_side` pixels in height and width.
+    ///
+    /// # Errors
+    ///
+    /// As [`Pilot::steer_encoded`].
+    pub fn answer_encoded_within(&mut self, bytes: &[u8], max_side: usize) -> Result<Answer> {
         let mut image = std::mem::take(&mut self.image);
-        let steering = match decode_rgb_within(bytes, max_side, &mut image) {
-            Ok(()) => self.steer(image.view()),
+        let answer = match decode_rgb_within(bytes, max_side, &mut image) {
+            Ok(()) => self.answer(image.view()),
             Err(message) => Err(Error::Codec(message)),
         };
         self.image = image;
-        steering
+        answer
     }
 
     /// Steering for an image file.
@@ -212,8 +272,17 @@ impl Pilot {
     ///
     /// [`Error::Io`] if it cannot be read, [`Error::Data`] if it is no image.
     pub fn steer_file(&mut self, path: &Path) -> Result<f32> {
+        Ok(self.answer_file(path)?.steering)
+    }
+
+    /// All that the model answers for an image file.
+    ///
+    /// # Errors
+    ///
+    /// As [`Pilot::steer_file`].
+    pub fn answer_file(&mut self, path: &Path) -> Result<Answer> {
         let bytes = read_up_to(path, MAX_FILE_LEN, "a picture")?;
-        self.steer_encoded(&bytes).map_err(|e| match e {
+        self.answer_encoded_within(&bytes, MAX_SIDE).map_err(|e| match e {
             Error::Codec(message) | Error::Input(message) => Error::data(path, message),
             other => other,
         })

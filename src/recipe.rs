@@ -15,7 +15,7 @@ use steersman_kernels::{Backend, Isa};
 use crate::dataset::augment::Augmentation;
 use crate::dataset::preprocess::Preprocessing;
 use crate::dataset::split::SplitSpec;
-use crate::dataset::{Balance, Group, LabelKind, LabelSpec, Recording, SampleSpec, Targets};
+use crate::dataset::{Balance, Group, LabelSpec, Outputs, Recording, SampleSpec, Targets};
 use crate::engine::loss::{Loss, Smoothness};
 use crate::engine::network::{LayerSpec, Network};
 use crate::engine::optimizer::{AveragingSpec, OptimizerSpec, Schedule, ScheduleSpec};
@@ -45,6 +45,9 @@ pub struct Recipe {
     /// Angle of the front wheels at steering 1, in degrees; turns errors into degrees.
     #[serde(default = "default_full_lock_deg")]
     pub full_lock_deg: f64,
+    /// The outputs of the network, and how much the loss of each counts; the steering alone when absent.
+    #[serde(default, skip_serializing_if = "Outputs::is_default")]
+    pub outputs: Outputs,
     /// The function that training minimizes.
     #[serde(default)]
     pub loss: Loss,
@@ -73,9 +76,6 @@ pub struct Recipe {
     /// Where labels come from.
     #[serde(default, skip_serializing_if = "LabelSpec::is_default")]
     pub labels: LabelSpec,
-    /// How the simulator's expert labels what the main job records; its own steering when absent.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub expert: Option<ExpertSpec>,
     /// Which images of a row are used, and what that adds to the label.
     #[serde(default)]
     pub samples: SampleSpec,
@@ -93,16 +93,6 @@ pub struct Recipe {
     /// The learning-rate schedule.
     #[serde(default)]
     pub schedule: ScheduleSpec,
-}
-
-/// How the simulator's expert labels what the main job records. Recordings that are there already keep their labels.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct ExpertSpec {
-    /// The labels are the steering towards the point of the road's middle so far ahead of the rear axle, m; the expert itself
-    /// pursues one 6.13 m ahead at 20 mph. From farther, a place beside the middle asks for less steering, so that an error about
-    /// the place moves the wheel less.
-    pub label_look_ahead_m: f64,
 }
 
 /// Ends a run when the validation loss stops falling; the best weights become the model.
@@ -240,17 +230,38 @@ impl Recipe {
             let message = "a network needs a layer that computes something".into();
             return Err(Error::Network { layer: "(all)".into(), message });
         }
-        if network.output() != Shape::vector(1) {
+        let outputs = self.outputs.count();
+        if network.output() != Shape::vector(outputs) {
             let layer = network.layers().last().map_or(String::new(), |l| l.name.clone());
-            let message =
-                format!("the last layer must give one number, the steering; this one gives {}", network.output());
+            let gives = network.output();
+            let message = match outputs {
+                1 => format!(
+                    "the last layer must give one number, the steering; this one gives {gives}. `outputs` names more than that"
+                ),
+                _ => format!(
+                    "the last layer must give {outputs} numbers, one for each of the outputs {}; this one gives {gives}: set its \
+                     units to {outputs}, as with --set layers.last.units={outputs}",
+                    self.outputs.names()
+                ),
+            };
             return Err(Error::Network { layer, message });
         }
         Ok(network)
     }
 
-    /// The labels of `recordings`.
-    pub fn targets(&self, recordings: &[Recording]) -> Targets {
+    /// The labels of `recordings`, with `views` behind them, single pictures that a model met, and then `drives` of the simulator.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Data`] for recordings without what an output learns from.
+    pub fn targets(&self, recordings: &[Recording], views: &[Recording], drives: &[Recording]) -> Result<Targets> {
+        let targets =
+            self.steering_targets(recordings).with_views(views, &self.labels).with_drives(drives, &self.labels);
+        targets.with_outputs(recordings.iter().chain(views).chain(drives), &self.outputs, &self.labels)
+    }
+
+    /// The labels of the steering of `recordings`, whatever else the network gives.
+    pub fn steering_targets(&self, recordings: &[Recording]) -> Targets {
         Targets::of(recordings, &self.labels, &self.samples, &self.augmentation)
     }
 
@@ -299,22 +310,13 @@ impl Recipe {
                 );
             }
         }
-        if let Some(ExpertSpec { label_look_ahead_m }) = self.expert {
-            if !(3.0..=30.0).contains(&label_look_ahead_m) {
-                return Err(format!("expert.label_look_ahead_m must be 3 to 30 m, not {label_look_ahead_m}"));
-            }
-            if self.labels.kind == LabelKind::Path {
-                return Err("expert.label_look_ahead_m labels with what no wheel did, so the driven path does not follow from it: \
-                            labels.kind must be \"wheel\""
-                    .into());
-            }
-        }
         self.optimizer.check().map_err(|message| format!("[optimizer] {message}"))?;
         if let Some(averaging) = &self.averaging {
             averaging.check().map_err(|message| format!("averaging: {message}"))?;
         }
         self.schedule.check().map_err(|message| format!("[schedule] {message}"))?;
         self.preprocessing.validate().map_err(|e| e.to_string())?;
+        self.outputs.validate().map_err(|e| e.to_string())?;
         self.labels.validate().map_err(|e| e.to_string())?;
         self.samples.validate().map_err(|e| e.to_string())?;
         self.balance.validate().map_err(|e| e.to_string())?;
@@ -333,6 +335,17 @@ fn set(table: &mut toml::Table, entry: &str) -> Result<(), String> {
     let mut path: Vec<&str> = key.split('.').map(str::trim).collect();
     let last = path.pop().unwrap_or_default();
     let mut inner = table;
+    if let ["layers", layer] = path[..] {
+        let layers = inner.get_mut("layers").and_then(toml::Value::as_array_mut);
+        let layers = layers.ok_or_else(|| format!("--set {key}: the recipe has no list of `layers`"))?;
+        let count = layers.len();
+        let index = if layer == "last" { Some(count) } else { layer.parse().ok() };
+        let entry = index.and_then(|index: usize| layers.get_mut(index.wrapping_sub(1)));
+        inner = entry.and_then(toml::Value::as_table_mut).ok_or_else(|| {
+            format!("--set {key}: layers are counted from 1 to {count}, and `last` is the last one; found `{layer}`")
+        })?;
+        path.clear();
+    }
     for part in path {
         inner = inner
             .entry(part)
@@ -418,7 +431,8 @@ mod tests {
             recipe.starts_with("there is no recipe `lente` (did you mean `lenet`?); built in are default,"),
             "{recipe}"
         );
-        let layers = SHIPPED[3].1.replacen("filters = 6", "filter = 6", 1);
+        let (_, lenet) = SHIPPED.iter().find(|(name, _)| *name == "lenet").unwrap();
+        let layers = lenet.replacen("filters = 6", "filter = 6", 1);
         let layer = Recipe::parse("mine.toml", &layers, &[]).unwrap_err().to_string();
         assert_eq!(layer, "recipe mine.toml: layers, entry 2: unknown field `filter` (did you mean `filters`?)");
     }
@@ -438,8 +452,6 @@ mod tests {
         assert!(error(&["smoothness={temporal=1}", "samples.group=rows"]).contains("samples.group"));
         assert!(error(&["averaging={kind='ema', decay=1}"]).contains("averaging: decay must lie in [0, 1)"));
         assert!(error(&["averaging={kind='ema', decays=0.9}"]).contains("did you mean `decay`?"));
-        assert!(error(&["expert.label_look_ahead_m=0.1"]).contains("3 to 30 m"));
-        assert!(error(&["expert.label_look_ahead_m=10", "labels.kind=path"]).contains("labels.kind must be"));
         assert!(error(&["name='../x'"]).contains("letters, digits"));
         assert!(error(&["early_stopping={patience_epochs=1}", "split.validation_share=0"]).contains("validation side"));
         assert!(error(&["layers=[{kind='dense', units=100000000000000}]"]).contains("units"));

@@ -18,22 +18,16 @@ use steersman::simulator::{DriveOptions, Driver, Track, Zero, drive};
 use steersman::training::{TrainRequest, TrainResult, TrainingEvent, train};
 
 fn learn(folder: &Path, threads: usize) -> (TrainResult, TrackResult) {
-    let take = |reverse, recovery, seed| Take {
-        track: "lake".into(),
-        laps: 0.15,
-        reverse,
-        recovery,
-        seed,
-        label_look_ahead_m: None,
-    };
+    let take = |reverse, recovery, seed| Take { track: "lake".into(), laps: 0.15, reverse, recovery, seed };
     let takes = [take(false, false, 101), take(true, false, 102), take(false, true, 103), take(true, true, 104)];
     let overrides = ["epochs=8", "samples.flip=both", "samples.side_cameras=0.25"].map(String::from);
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
     pool.install(|| {
         let request = TrainRequest {
-            recordings: recordings(&folder.join("recordings"), &takes, &mut Unobserved).unwrap().0,
+            recordings: recordings(&folder.join("recordings"), &takes, None, &mut Unobserved).unwrap().0,
             validate: Vec::new(),
             also: Vec::new(),
+            simulator: Vec::new(),
             said: Description::default(),
             recipe: Recipe::find("lenet", &overrides).unwrap(),
             out: folder.join(format!("run-{threads}")),
@@ -77,14 +71,7 @@ fn what_is_learned_from_the_expert_drives_and_does_so_alike_for_any_number_of_th
 }
 
 fn small_scope(folder: &Path) -> Scope {
-    let take = |recovery, seed| Take {
-        track: "lake".into(),
-        laps: 0.05,
-        reverse: false,
-        recovery,
-        seed,
-        label_look_ahead_m: None,
-    };
+    let take = |recovery, seed| Take { track: "lake".into(), laps: 0.05, reverse: false, recovery, seed };
     Scope {
         recordings: folder.join("recordings"),
         takes: vec![take(false, 1), take(true, 2)],
@@ -150,7 +137,7 @@ fn a_job_that_was_stopped_goes_on_through_dagger_to_the_drives() {
 fn the_experiments_train_and_drive_every_variant() {
     let folder = tempfile::tempdir().unwrap();
     let scope = small_scope(folder.path());
-    let recordings = recordings(&scope.recordings, &scope.takes, &mut Unobserved).unwrap().0;
+    let recordings = recordings(&scope.recordings, &scope.takes, None, &mut Unobserved).unwrap().0;
     let go = |subject, stop: &StopSignal| {
         let plan = ExperimentPlan {
             subject,

@@ -188,6 +188,60 @@ fn c_source_compiles_without_a_warning_and_agrees() {
     for recipe in ["hyper", "lenet", "pilotnet", "default"].map(shipped).into_iter().chain(every_layer()) {
         compare(&model(recipe), "c", "model.c", &compile);
     }
+    for recipe in two_outputs() {
+        let folder = tempfile::tempdir().unwrap();
+        fs::write(folder.path().join("driver.c"), C_OUTPUTS_DRIVER).unwrap();
+        compare_outputs(&model(recipe), "c", "model.c", folder.path(), &|dir| {
+            let args = ["-std=c99", "-Wall", "-Wextra", "-pedantic", "-Werror", "-O2", "driver.c", "-o", "driver"];
+            run_tool(Command::new("cc").args(args).current_dir(dir));
+        });
+    }
+}
+
+const C_OUTPUTS_DRIVER: &str = r#"
+#include <stdint.h>
+#include <stdio.h>
+#include "model.c"
+int main(int argc, char **argv) {
+    static uint8_t image[STEER_HEIGHT * STEER_WIDTH * 3];
+    FILE *file = argc > 1 ? fopen(argv[1], "rb") : NULL;
+    while (file && fread(image, sizeof image, 1, file) == 1) {
+        float outputs[STEER_OUTPUTS];
+        steer_outputs(image, outputs);
+        if (steer(image) != outputs[STEER_STEERING]) return 1;
+        for (int i = 0; i < STEER_OUTPUTS; i++) printf("%.9g\n", outputs[i]);
+    }
+    return 0;
+}
+"#;
+
+/// Recipes with a second output; the names of the places differ.
+fn two_outputs() -> impl Iterator<Item = Recipe> {
+    let throttle = "outputs=[{ name = 'steering' }, { name = 'throttle' }]";
+    let speed = "outputs=[{ name = 'steering' }, { name = 'speed', top_speed_mph = 30 }]";
+    [("lenet", throttle), ("default", speed)]
+        .into_iter()
+        .map(|(name, outputs)| Recipe::find(name, &["layers.last.units=2", outputs].map(String::from)).unwrap())
+}
+
+/// As [`compare`] for a program that prints each output in a line of its own, made by `compile` in `dir` from the export there.
+fn compare_outputs(model: &Model, language: &str, file: &str, dir: &Path, compile: &dyn Fn(&Path)) {
+    model.save(&dir.join("model.safetensors")).unwrap();
+    run(dir, &["export", "model.safetensors", file, "--to", language]);
+    let pictures = pictures(model.recipe.preprocessing.source, 10);
+    fs::write(dir.join("pictures.rgb"), pictures.concat()).unwrap();
+    compile(dir);
+    let printed = run_tool(Command::new(dir.join("driver")).arg("pictures.rgb").current_dir(dir));
+    let answers: Vec<f32> = printed.lines().map(|line| line.parse().unwrap()).collect();
+    let [h, w] = model.recipe.preprocessing.source;
+    let images = ndarray::Array4::from_shape_vec((10, h, w, 3), pictures.concat()).unwrap();
+    let expected = Pilot::new(model.clone(), Isa::best()).unwrap().predict_outputs(images.view()).unwrap();
+    assert_eq!(answers.len(), 20);
+    for (answer, expected) in answers.iter().zip(&expected) {
+        let error = (answer - expected).abs() / expected.abs().max(1.0);
+        assert!(error <= BOUND, "{language}: {answer} instead of {expected}");
+    }
+    assert!((expected[[0, 0]] - expected[[0, 1]]).abs() > 1e-3, "outputs that are alike do not show their order");
 }
 
 const RUST_DRIVER: &str = r#"
@@ -221,7 +275,33 @@ fn rust_source_compiles_without_a_warning_or_std_and_agrees() {
     for recipe in ["hyper", "lenet", "pilotnet", "default"].map(shipped).into_iter().chain(every_layer()) {
         compare(&model(recipe), "rust", "model.rs", &compile);
     }
+    for recipe in two_outputs() {
+        let folder = tempfile::tempdir().unwrap();
+        fs::write(folder.path().join("driver.rs"), RUST_OUTPUTS_DRIVER).unwrap();
+        compare_outputs(&model(recipe), "rust", "model.rs", folder.path(), &|dir| {
+            let args = ["--edition", "2021", "-C", "opt-level=2", "driver.rs", "-o", "driver"];
+            run_tool(Command::new(&rustc).args(args).current_dir(dir));
+        });
+    }
 }
+
+const RUST_OUTPUTS_DRIVER: &str = r#"
+#![deny(warnings)]
+#![allow(dead_code)]
+mod model;
+use std::io::Read;
+static MODEL: std::sync::Mutex<model::Model> = std::sync::Mutex::new(model::Model::new());
+fn main() {
+    let mut file = std::fs::File::open(std::env::args().nth(1).unwrap()).unwrap();
+    let mut image = [0; model::HEIGHT * model::WIDTH * 3];
+    while file.read_exact(&mut image).is_ok() {
+        let mut model = MODEL.lock().unwrap();
+        let outputs: [f32; model::OUTPUTS] = model.outputs(&image);
+        assert_eq!(model.steer(&image), outputs[model::STEERING]);
+        outputs.iter().for_each(|output| println!("{output:?}"));
+    }
+}
+"#;
 
 /// A Python with what `tests/exchange/check_onnx.py` needs, or a printed reason.
 fn python() -> Option<PathBuf> {
@@ -243,8 +323,9 @@ fn onnx_files_pass_the_checker_and_agree_in_onnx_runtime() {
     let Some(python) = python() else { return };
     let folder = tempfile::tempdir().unwrap();
     let mut models = Vec::new();
-    for recipe in ["hyper", "hyper-prelu", "lenet", "pilotnet", "default"].map(shipped).into_iter().chain(every_layer())
-    {
+    let named = two_outputs().map(|recipe| Recipe { name: format!("{}-two-outputs", recipe.name), ..recipe });
+    let one = ["hyper", "hyper-prelu", "lenet", "pilotnet", "default"].map(shipped).into_iter().chain(every_layer());
+    for recipe in one.chain(named) {
         let path = folder.path().join(format!("{}.safetensors", recipe.name));
         model(recipe).save(&path).unwrap();
         models.push(path);

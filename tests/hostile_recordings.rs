@@ -366,6 +366,7 @@ fn damaged_runs_go_on_or_are_refused() {
     let request = TrainRequest {
         validate: Vec::new(),
         also: Vec::new(),
+        simulator: Vec::new(),
         recordings: vec![log],
         said: Description::default(),
         recipe: Recipe::find("lenet", &settings.map(String::from)).unwrap(),

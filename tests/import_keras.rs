@@ -37,11 +37,12 @@ fn agrees(file: &str, model: &str, options: &ImportOptions) {
     let imported = import(&golden(file), options).unwrap_or_else(|e| panic!("{file}: {e}"));
     let input: Vec<usize> = serde_json::from_value(expected[model]["input"].clone()).unwrap();
     assert_eq!(imported.input, Shape::new(input[2], input[0], input[1]), "{file}");
-    let images = images(outputs.len(), imported.input);
+    let images = images(expected["images"].as_u64().unwrap() as usize, imported.input);
     for isa in Isa::available() {
         let network = Network::new(imported.input, &imported.layers, isa).unwrap();
         let view: ArrayView4<f32> = images.view();
         let found = network.predict(&imported.parameters, view).unwrap();
+        assert_eq!(found.len(), outputs.len(), "{file}");
         for (found, expected) in found.iter().zip(&outputs) {
             assert!((f64::from(*found) - expected).abs() <= 1e-5, "{file}, {}: {found} for {expected}", isa.name());
         }
@@ -57,6 +58,33 @@ fn files_of_todays_keras_agree_with_it() {
         ("functional.h5", "functional"),
     ] {
         agrees(file, model, &ImportOptions::default());
+    }
+}
+
+/// Image by image, the steering and the throttle.
+#[test]
+fn two_outputs_of_one_trunk_are_steering_and_throttle() {
+    for file in ["donkey.keras", "donkey.h5"] {
+        agrees(file, "donkey", &ImportOptions::default());
+        let imported = import(&golden(file), &ImportOptions::default()).unwrap();
+        let heads: Vec<_> = imported.report.iter().rev().take(2).map(|layer| (&*layer.layer, &layer.becomes)).collect();
+        let last = vec!["dense2".to_string()];
+        assert_eq!(heads, [("n_outputs1", &last), ("n_outputs0", &last)]);
+        let notice = &imported.notices[0];
+        assert!(notice.contains("(`n_outputs0` and `n_outputs1`): the first counts as steering"), "{notice}");
+    }
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("p.toml"), "source = [22, 30]\nrows = [0, 22]\nresize = [22, 30]").unwrap();
+    let file = golden("donkey.h5");
+    run(folder.path(), &["import", file.to_str().unwrap(), "--preprocessing", "p.toml", "--out", "m.safetensors"]);
+    let pixels = images(1, Shape::new(3, 22, 30)).map(|level| *level as u8).index_axis_move(ndarray::Axis(0), 0);
+    let picture =
+        image::RgbImage::from_fn(30, 22, |x, y| image::Rgb([0, 1, 2].map(|c| pixels[[c, y as usize, x as usize]])));
+    picture.save(folder.path().join("picture.png")).unwrap();
+    let answer = json(folder.path(), &["predict", "m.safetensors", "picture.png", "--json"]);
+    let outputs: Vec<f64> = serde_json::from_value(expected()["donkey"]["outputs"].clone()).unwrap();
+    for (name, expected) in ["steering", "throttle"].iter().zip(outputs) {
+        assert!((answer[0][name].as_f64().unwrap() - expected).abs() < 1e-5, "{name}: {answer}, not {expected}");
     }
 }
 

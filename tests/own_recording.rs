@@ -195,6 +195,52 @@ fn dagger_on_the_recording_trains_on_what_the_model_met_and_never_on_the_validat
     assert!(error(dir, &train).contains("run-dagger-1 is not empty"));
 }
 
+/// A training with rounds that ends between two of them goes on with the next one.
+#[test]
+fn rounds_of_dagger_follow_after_a_stop() {
+    let scratch = tempfile::tempdir().unwrap();
+    let dir = scratch.path();
+    record(dir, "1", "drive");
+    let train = ["train", "drive", "--recipe", "lenet", "--set", "epochs=2", "--dagger", "2", "--out"];
+    let whole = json(dir, &[&train[..], &["run", "--json"]].concat());
+    let note = |run: &str| fs::read_to_string(dir.join(run).join("dagger.json")).unwrap();
+    assert!(note("run").contains("\"round\": 0") && note("run-dagger-1").contains("\"round\": 1"));
+    // As after a stop in the second round, before its training began; and then in the driving of the first one.
+    for gone in [&["run-dagger-2"][..], &["run-dagger-1", "run-dagger-2", "run/dagger"]] {
+        gone.iter().for_each(|path| fs::remove_dir_all(dir.join(path)).unwrap());
+        let from = if gone.len() == 1 { "run-dagger-1" } else { "run" };
+        let told = json(dir, &["train", "--resume", from, "--json"]);
+        assert_eq!(told["weights_hash"], whole["weights_hash"], "{from}");
+        assert_eq!(told["dagger"].as_array().unwrap().len(), 3);
+        assert!(dir.join("run-dagger-2/report.html").is_file());
+    }
+    // A training that cannot begin leaves no note.
+    let said = error(dir, &["train", "missing", "--dagger", "1", "--out", "none"]);
+    assert!(said.contains("missing") && !dir.join("none/dagger.json").exists(), "{said}");
+}
+
+/// One picture that cannot be read costs its frames, and no round.
+#[test]
+fn dagger_leaves_out_what_cannot_be_read_and_says_so() {
+    let scratch = tempfile::tempdir().unwrap();
+    let dir = scratch.path();
+    record(dir, "1", "drive");
+    let pictures: Vec<_> = fs::read_dir(dir.join("drive/IMG")).unwrap().map(|entry| entry.unwrap().path()).collect();
+    // They begin and end as JPEGs, so that they are noticed only when they are decoded.
+    for camera in ["center", "left", "right"] {
+        let mut of_camera: Vec<_> = pictures.iter().filter(|path| path.to_string_lossy().contains(camera)).collect();
+        of_camera.sort();
+        for path in of_camera.iter().skip(40).take(3) {
+            fs::write(path, b"\xff\xd8\xff\xe0 nothing \xff\xd9").unwrap();
+        }
+    }
+    let train = ["train", "drive", "--recipe", "lenet", "--set", "epochs=1", "--set", "split.validation_share=0"];
+    let output = run(dir, &[&train[..], &["--dagger", "1", "--out", "run"]].concat());
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert!(said.contains("frames have no picture that can be read") && said.contains("IMG"), "{said}");
+    assert!(dir.join("run-dagger-1/result.json").is_file());
+}
+
 #[test]
 fn the_experiment_orders_models_on_the_road_and_on_recordings() {
     let scratch = tempfile::tempdir().unwrap();
@@ -210,6 +256,21 @@ fn the_experiment_orders_models_on_the_road_and_on_recordings() {
     assert!(csv.lines().last().unwrap().contains("noise 0.2"));
     assert!(fs::read_to_string(dir.join("found.html")).unwrap().contains("autonomy on recordings"));
     assert!(error(dir, &["experiment", "replay", "--recording", "x"]).contains("recordings of its own"));
+    // The page takes the place of nothing, nor is anything ignored that was asked for.
+    let out = |name: &str| error(dir, &["experiment", "replay", "--quick", "--out", name]);
+    assert!(out("r.html").contains("r.csv") && !dir.join("r.html").exists());
+    fs::write(dir.join("mine.html"), "mine").unwrap();
+    assert!(out("mine.csv").contains("mine.html: exists already") && !dir.join("mine.csv").exists());
+    for (option, why) in [
+        (&["--recipe", "lenet"][..], "several recipes"),
+        (&["--set", "epochs=1"], "several recipes"),
+        (&["--hz", "5"], "recordings of its own"),
+        (&["--random-tracks", "2"], "--track"),
+    ] {
+        let said = error(dir, &[&["experiment", "replay"][..], option].concat());
+        assert!(said.contains(why), "{option:?}: {said}");
+    }
+    assert!(error(dir, &["experiment", "labels", "--random-tracks", "2"]).contains("drives with keys"));
 }
 
 /// The whole loop: a poor model drives, somebody corrects it, and training goes on with the corrections.

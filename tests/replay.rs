@@ -5,7 +5,7 @@ mod common;
 use std::path::Path;
 use std::sync::Mutex;
 
-use common::command::{error, json, run};
+use common::command::{error, json, run, steersman};
 use common::mp4;
 use common::page::{Page, serve};
 use steersman::dataset::{self, DrivenSessions};
@@ -205,6 +205,16 @@ fn the_command_tells_writes_and_refuses() {
     let told = run(dir, &["drive", "zero", "--on", "drive", "--latency-ms", "0,200"]).stdout;
     let table = String::from_utf8(told).unwrap();
     assert!(table.contains("200 ms") && table.contains("reversals"), "{table}");
+
+    // What was driven is told, whatever cannot be written; the command fails all the same.
+    let nowhere = ["drive", "zero", "--on", "drive", "--video", "drive/driving_log.csv/film.mp4"];
+    let output = steersman(dir).args(nowhere).output().unwrap();
+    let [told, trouble] = [output.stdout, output.stderr].map(|bytes| String::from_utf8(bytes).unwrap());
+    assert!(!output.status.success() && trouble.contains("film.mp4"), "{trouble}");
+    assert!(told.contains("autonomy") && told.contains("warped views can be trusted"), "{told}");
+    let output = steersman(dir).args(nowhere).arg("--json").output().unwrap();
+    let told: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert!(!output.status.success() && told["interventions"].as_u64() > Some(2), "{told}");
 }
 
 #[test]

@@ -11,12 +11,15 @@ use std::time::{Duration, Instant};
 use common::command::{error, json, steersman};
 use common::served::{Client, SIMULATOR, Served, command, random_model, sample_jpeg, telemetry};
 use serde_json::Value;
+use steersman::model_file::{Model, TrainingRecord};
 use steersman::observer::Unobserved;
 use steersman::pilot::Pilot;
+use steersman::recipe::Recipe;
 use steersman::simulator::run_trial;
 use steersman::simulator::{Speed, Track, TrialOptions};
 use steersman::simulator_client::{ClientOptions, ClientReport, TimeMode, drive};
 use steersman::udacity::{DecimalMark, NumberStyle};
+use steersman_kernels::Isa;
 
 /// Long enough for an answer that must not come. (Where the machine stands still, a wrong answer could be missed, not invented.)
 const QUIET: Duration = Duration::from_millis(400);
@@ -67,6 +70,33 @@ fn in_lockstep_the_way_through_the_server_is_the_way_of_drive_bit_for_bit_in_eve
     let (summary, said) = served.stop();
     assert_eq!(count(&summary, "frames"), 2 * expected.moments.len() as u64);
     assert!(said.contains("decimal mark"), "{said}");
+}
+
+#[test]
+fn with_the_throttle_of_the_model_the_way_is_that_of_drive_too() {
+    let folder = tempfile::tempdir().unwrap();
+    let throttle = "outputs=[{ name = 'steering' }, { name = 'throttle' }]";
+    let speed = "outputs=[{ name = 'steering' }, { name = 'speed', top_speed_mph = 24 }]";
+    for (name, outputs) in [("throttle", throttle), ("speed", speed)] {
+        let recipe = Recipe::find("lenet", &["layers.last.units=2", outputs].map(String::from)).unwrap();
+        let network = recipe.network(Isa::best()).unwrap();
+        let mut parameters = network.initialize(1);
+        // So that the car moves whatever the random weights say.
+        parameters.tensor_mut(network.tensor("dense3.bias").unwrap())[1] = 0.6;
+        let path = folder.path().join(name);
+        Model { recipe, parameters, record: TrainingRecord::default(), training_rows: vec![] }.save(&path).unwrap();
+        let served = Served::start(folder.path(), name, &["--speed", "20", "--throttle", "model"]);
+        let options =
+            TrialOptions { laps: 1, speed: Speed::Driver(20.0), latency_ms: 0.0, noise: 0.0, assisted: false };
+        let mut pilot = Pilot::load(&path).unwrap();
+        let expected = run_trial(&Track::load("lake").unwrap(), &mut pilot, &options, 2).unwrap();
+        assert!(expected.moments.len() > 30, "{} frames are too few to prove something", expected.moments.len());
+        let first = expected.moments[0].throttle;
+        assert!(expected.moments.iter().any(|moment| moment.throttle != first), "{name}: always {first}");
+        let report = drive_lake(&ClientOptions { start_mph: 12.0, ..lockstep(&served) });
+        assert_eq!(report.run, expected, "{name}");
+        served.stop();
+    }
 }
 
 #[test]

@@ -130,6 +130,7 @@ fn watched(log: &Path, out: &Path, at_batch: &dyn Fn()) -> (steersman::Result<Tr
         recordings: vec![log.to_path_buf()],
         validate: Vec::new(),
         also: Vec::new(),
+        simulator: Vec::new(),
         said: Description::default(),
         recipe: Recipe::find("lenet", &settings).unwrap(),
         out: out.to_path_buf(),
@@ -241,4 +242,68 @@ fn the_model_is_the_mean_of_the_weights_over_the_last_updates_and_is_what_is_val
             max_relative = 1e-6
         );
     }
+}
+
+#[test]
+fn a_run_with_the_simulators_set_goes_on_with_it_and_tells_of_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let [log, set] = ["log", "set/lake"].map(|name| folder.path().join(name));
+    painted_log::write(&log, 300, "");
+    painted_log::write(&set, 500, "");
+    let settings = [LINEAR, "preprocessing.resize=[16, 16]", "batch=16", "epochs=3", "samples.simulator_share=0.4"];
+    let request = |out: &str, simulator: &[&Path]| TrainRequest {
+        recordings: vec![log.clone()],
+        validate: Vec::new(),
+        also: Vec::new(),
+        simulator: simulator.iter().map(|path| path.to_path_buf()).collect(),
+        said: Description::default(),
+        recipe: Recipe::find("lenet", &settings.map(String::from)).unwrap(),
+        out: folder.path().join(out),
+        seed: 5,
+        cache_mib: 64,
+        from: None,
+        algorithm: None,
+        profile: false,
+    };
+    let stop = StopSignal::default();
+    let train = |out: &str, simulator: &[&Path]| {
+        training::train(request(out, simulator), &mut |_: TrainingEvent| Ok(()), &stop).unwrap()
+    };
+    let (alone, whole) = (train("alone", &[]), train("whole", &[&set]));
+    let own = alone.train_images;
+    assert_eq!((alone.simulator_images, alone.val_images), (0, whole.val_images));
+    assert_eq!(whole.train_images, own + whole.simulator_images);
+    assert_eq!(whole.simulator_images, (own as f64 * 0.4 / 0.6).round() as usize);
+    assert_ne!(alone.weights_hash, whole.weights_hash);
+    // Another set is another run, also where the seed is the same.
+    let hash = |out: &str| {
+        let info = std::fs::read_to_string(folder.path().join(out).join("run.json")).unwrap();
+        let info: serde_json::Value = serde_json::from_str(&info).unwrap();
+        (info["rows_hash"].as_str().unwrap().to_string(), info["simulator"].as_array().map(Vec::len))
+    };
+    assert_eq!([hash("alone").1, hash("whole").1], [None, Some(1)]);
+    assert_ne!(hash("alone").0, hash("whole").0);
+
+    let mut batches = 0;
+    let mut stopping = |event: TrainingEvent| {
+        batches += usize::from(matches!(event, TrainingEvent::Batch { .. }));
+        if batches > whole.train_images / 16 + 3 { Err(steersman::Error::Interrupted) } else { Ok(()) }
+    };
+    assert!(training::train(request("stopped", &[&set]), &mut stopping, &stop).is_err());
+    let stopped = folder.path().join("stopped");
+    let moved = folder.path().join("elsewhere");
+    std::fs::rename(&set, &moved).unwrap();
+    let resume = || training::resume(&stopped, false, &mut |_: TrainingEvent| Ok(()), &stop);
+    let gone = resume().unwrap_err().to_string();
+    assert!(gone.contains("simulator's set") && gone.contains("--with-simulator"), "{gone}");
+    std::fs::rename(&moved, &set).unwrap();
+    assert_eq!(resume().unwrap().weights_hash, whole.weights_hash);
+    let split = std::fs::read_to_string(stopped.join("split.csv")).unwrap();
+    assert_eq!(split.lines().filter(|line| line.contains(",simulator,")).count(), 500);
+    let page = steersman::report::pages::run::write(&stopped).unwrap();
+    let page = std::fs::read_to_string(page).unwrap();
+    assert!(
+        page.contains("the simulator's set of 1 recordings")
+            || page.contains("the simulator&#39;s set of 1 recordings")
+    );
 }

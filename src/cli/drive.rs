@@ -9,6 +9,7 @@ use super::drive_sweep;
 use super::recording_args::RecordingArgs;
 use super::replay::{self, ReplayArgs};
 use super::share_bar::ShareBar;
+use super::throttle::Throttle;
 use super::video::tell_video;
 use super::{load_pilot, pool, print, print_json, stop_on_ctrl_c};
 use crate::dataset::held_out::trained_on_held_out;
@@ -49,9 +50,12 @@ pub struct DriveArgs {
     /// Laps of each run
     #[arg(long, default_value_t = 1)]
     laps: usize,
-    /// Speed to hold in mph, or `auto`: 30 mph, less in bends
-    #[arg(long, default_value = "20", value_name = "MPH|auto", value_parser = speed)]
-    speed: Speed,
+    /// Speed to hold in mph, or `auto`: 30 mph, less in bends [default: 20]; with --throttle model the highest [default: 30]
+    #[arg(long, value_name = "MPH|auto", value_parser = speed)]
+    speed: Option<Speed>,
+    /// Who gives the throttle: a controller that holds --speed, or the model, by its output `throttle` or `speed`
+    #[arg(long, value_enum, default_value_t = Throttle::Hold, conflicts_with = "on")]
+    pub(super) throttle: Throttle,
     /// Runs, each with a seed of its own, counted from --seed
     #[arg(long, default_value_t = 10)]
     pub(super) runs: usize,
@@ -149,12 +153,12 @@ pub fn run(args: DriveArgs) -> Result<()> {
         }
     };
     let options =
-        DriveOptions { laps: args.laps, runs: args.runs, seed: args.seed, speed: args.speed, latency_ms, noise };
+        DriveOptions { laps: args.laps, runs: args.runs, seed: args.seed, speed: args.aimed_at()?, latency_ms, noise };
     if let Some((swept, values)) = swept {
         return drive_sweep::run(&args, &track, &options, swept, values);
     }
-    let at_wheel = Wheel::find(&args.model)?;
-    let against = args.against.as_deref().map(Wheel::find).transpose()?;
+    let at_wheel = args.wheel(&args.model)?;
+    let against = args.against.as_deref().map(|name| args.wheel(name)).transpose()?;
     // What cannot be created is told before minutes are spent.
     let folder = args.out.as_deref().map(NewFolder::create).transpose()?;
     let then = args.against.as_ref().map_or(String::new(), |name| format!(", then {name}"));
@@ -213,6 +217,29 @@ pub fn run(args: DriveArgs) -> Result<()> {
     }
     print(&text)?;
     saved.and(video.map_or(Ok(()), film))
+}
+
+impl DriveArgs {
+    /// The speed that `--speed` and `--throttle` ask for.
+    fn aimed_at(&self) -> Result<Speed> {
+        match (self.throttle, self.speed) {
+            (Throttle::Hold, speed) => Ok(speed.unwrap_or(Speed::Fixed(20.0))),
+            (Throttle::Model, None) => Ok(Speed::Driver(30.0)),
+            (Throttle::Model, Some(Speed::Fixed(mph))) => Ok(Speed::Driver(mph)),
+            (Throttle::Model, Some(_)) => Err(Error::Usage(
+                "--throttle model does not go with --speed auto: give the highest speed in mph".into(),
+            )),
+        }
+    }
+
+    /// Who is called `name`, and gives what `--throttle` asks for.
+    pub(super) fn wheel(&self, name: &str) -> Result<Wheel> {
+        let wheel = Wheel::find(name)?;
+        if let Wheel::Model(pilot) = &wheel {
+            self.throttle.check(pilot, name)?;
+        }
+        Ok(wheel)
+    }
 }
 
 /// The first of the values of an option, which has at least one.

@@ -37,7 +37,7 @@ impl<'a> Report<'a> {
 pub fn run(args: &DriveArgs, track: &Track, options: &DriveOptions, swept: Swept, values: &[f64]) -> Result<()> {
     let drives = drives(options, swept, values)?;
     let drivers: Vec<&str> = std::iter::once(args.model.as_str()).chain(args.against.as_deref()).collect();
-    let wheels = drivers.iter().map(|name| Wheel::find(name)).collect::<Result<Vec<Wheel>>>()?;
+    let wheels = drivers.iter().map(|name| args.wheel(name)).collect::<Result<Vec<Wheel>>>()?;
     // What cannot be created is told before minutes are spent.
     let folder = args.out.as_deref().map(NewFolder::create).transpose()?;
     let stop = stop_on_ctrl_c()?;

@@ -11,11 +11,12 @@ use steersman_kernels::Isa;
 use super::recording_args::RecordingArgs;
 use super::{load_model, or_dash, pool, print_json};
 use crate::dataset::held_out::trained_on_held_out;
-use crate::dataset::{DrivenSessions, Recording, View};
+use crate::dataset::{DrivenSessions, OutputKind, OutputSpec, Outputs, Recording, View};
 use crate::error::{Error, Result};
 use crate::geometry::LookAhead;
-use crate::metrics::{Metrics, Prediction};
-use crate::pilot::Pilot;
+use crate::metrics::{Metrics, OutputMetrics, Prediction};
+use crate::picture::decode::MAX_SIDE;
+use crate::pilot::{Answer, Pilot};
 
 /// Compare a model's steering with what was recorded: centre camera, every usable row
 #[derive(Debug, Args)]
@@ -45,6 +46,12 @@ struct Report<'a> {
     metrics: &'a Metrics,
     #[serde(flatten)]
     path: Option<PathReport>,
+    /// Of models that give a throttle.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    throttle: Option<OutputMetrics>,
+    /// Of models that give a speed, mph.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    speed_mph: Option<OutputMetrics>,
     #[serde(skip_serializing_if = "<[String]>::is_empty")]
     trained_on_held_out: &'a [String],
 }
@@ -79,6 +86,8 @@ pub fn run(args: EvaluateArgs) -> Result<()> {
         return Err(Error::Usage(format!("--look-ahead-s {}: 0 to 10 s can be looked ahead", args.look_ahead_s)));
     }
     let (mut predictions, mut path_predictions, mut assumed_mps) = (Vec::new(), Vec::new(), None);
+    let beside = Beside::of(&pilot.recipe().outputs);
+    let mut pairs_beside = Vec::new();
     let (mut known, mut sessions_before) = (0, 0);
     for path in &args.reading.expand(args.recordings)? {
         let recording = pool.install(|| args.reading.load(path))?;
@@ -91,7 +100,11 @@ pub fn run(args: EvaluateArgs) -> Result<()> {
         let driven = DrivenSessions::of(&recording, recording.geometry.clone());
         assumed_mps = assumed_mps.or(driven.assumed_speed_mps);
         let path_labels = driven.path_labels(look_ahead);
-        for (row, prediction) in pool.install(|| predict(&pilot, &recording, sessions_before)) {
+        let labels_beside = beside.as_ref().map(|beside| beside.output.recorded(&recording));
+        for (row, prediction, answer) in pool.install(|| predict(&pilot, &recording, sessions_before)) {
+            if let (Some(beside), Some(labels)) = (&beside, &labels_beside) {
+                pairs_beside.extend(beside.pair(&answer, labels[row]));
+            }
             predictions.push(prediction);
             path_predictions.extend(path_labels[row].map(|label| Prediction { label, ..prediction }));
         }
@@ -109,6 +122,11 @@ pub fn run(args: EvaluateArgs) -> Result<()> {
         path_relative_to_zero: metrics.relative_to_zero,
         path_assumed_speed_mps: assumed_mps,
     });
+    let of_beside = OutputMetrics::of(&pairs_beside);
+    if let (Some(beside), None) = (&beside, &of_beside) {
+        let name = beside.output.name.name();
+        eprintln!("note: no row has a {name}, so that of the model cannot be judged");
+    }
     if known > 0 {
         eprintln!(
             "note: {known} of {} rows belong to the model's training split: this is no test of how well it generalises",
@@ -116,7 +134,9 @@ pub fn run(args: EvaluateArgs) -> Result<()> {
         );
     }
     if args.json {
-        return print_json(&Report { metrics: &metrics, path, trained_on_held_out: &held_out });
+        let of = |kind| of_beside.filter(|_| beside.as_ref().is_some_and(|beside| beside.output.name == kind));
+        let (throttle, speed_mph) = (of(OutputKind::Throttle), of(OutputKind::Speed));
+        return print_json(&Report { metrics: &metrics, path, throttle, speed_mph, trained_on_held_out: &held_out });
     }
     if !held_out.is_empty() {
         println!("note: the model was {}", trained_on_held_out(&held_out));
@@ -145,23 +165,54 @@ pub fn run(args: EvaluateArgs) -> Result<()> {
             println!("  no speed was recorded; {mps:.1} m/s was assumed");
         }
     }
+    if let (Some(beside), Some(m)) = (&beside, of_beside) {
+        let (name, unit) = (beside.output.name.name(), beside.unit);
+        println!("{:<27}{} rows, mean {:.3}{unit}", format!("{name} as recorded"), m.rows, m.label_mean);
+        println!("  MAE                      {:.3}{unit}", m.mae);
+        println!("  RMSE                     {:.3}{unit}", m.rmse);
+        println!("  bias                     {:+.3}{unit}", m.bias);
+        println!("  R2                       {}", or_dash(m.r2, 3));
+        println!("  correlation              {}", or_dash(m.correlation, 3));
+    }
     Ok(())
 }
 
-/// Predictions for the centre images of all rows, each with its row; images that cannot be decoded are reported and left out.
-fn predict(pilot: &Pilot, recording: &Recording, sessions_before: usize) -> Vec<(usize, Prediction)> {
+/// The output beside the steering.
+struct Beside {
+    output: OutputSpec,
+    /// Of its unit in one of the output.
+    scale: f64,
+    unit: &'static str,
+}
+
+impl Beside {
+    fn of(outputs: &Outputs) -> Option<Beside> {
+        let output = *outputs.specs().get(1)?;
+        let (scale, unit) = outputs.top_speed_mph().map_or((1.0, ""), |mph| (mph, " mph"));
+        Some(Beside { output, scale, unit })
+    }
+
+    /// Prediction and label, where there is one.
+    fn pair(&self, answer: &Answer, label: f32) -> Option<(f64, f64)> {
+        let predicted = answer.throttle.or(answer.speed).filter(|_| !label.is_nan())?;
+        Some((self.scale * f64::from(predicted), self.scale * f64::from(label)))
+    }
+}
+
+/// Predictions for the centre images of all rows, each with its row and the whole answer; images that cannot be decoded are reported and left out.
+fn predict(pilot: &Pilot, recording: &Recording, sessions_before: usize) -> Vec<(usize, Prediction, Answer)> {
     let session_of = |row: usize| recording.sessions.partition_point(|session| session.end <= row);
     let predict_row = |pilot: &mut Pilot, row: usize| {
         let mut bytes = Vec::new();
         let read = recording.read_picture(row, View::Centre, &mut bytes);
         let place = || recording.image_path(row, View::Centre).unwrap_or_default();
         let named = |error: Error| Error::data(place(), error.to_string());
-        match read.and_then(|()| pilot.steer_encoded(&bytes).map_err(named)) {
-            Ok(steering) => {
-                let label = recording.rows[row].steering;
+        match read.and_then(|()| pilot.answer_encoded_within(&bytes, MAX_SIDE).map_err(named)) {
+            Ok(answer) => {
+                let (steering, label) = (answer.steering, recording.rows[row].steering);
                 let session = sessions_before + session_of(row);
                 let time_s = recording.rows[row].time_ms as f64 / 1000.0;
-                Some((row, Prediction { steering, label, session, time_s }))
+                Some((row, Prediction { steering, label, session, time_s }, answer))
             }
             Err(error) => {
                 eprintln!("left out: {error}");

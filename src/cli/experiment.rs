@@ -1,7 +1,7 @@
-//! `steersman experiment`: the two experiments of the write-ups and what makes the wheel calm, each to the end of the road; and one of
-//! the replay.
+//! `steersman experiment`: the two experiments of the write-ups, what labels are, and what makes the wheel calm, each to the end of the
+//! road; and one of the replay.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
 
@@ -11,32 +11,40 @@ use super::recording_args::RecordingArgs;
 use super::{RecipeArgs, or_dash, pool, print_json, refuse_existing, stop_on_ctrl_c};
 use crate::dataset::held_out::{self, trained_on_held_out};
 use crate::error::{Error, Result};
-use crate::main_job::experiment::{self, ExperimentEvent, ExperimentPlan, ExperimentRow, Subject, takes, write_csv};
+use crate::main_job::experiment::{
+    self, ExperimentEvent, ExperimentPlan, ExperimentRow, Subject, keyboard_drives, takes, write_csv,
+};
 use crate::main_job::job::{RECORDINGS, training_set};
-use crate::main_job::training_set::{RANDOM_TRACKS, labelled};
+use crate::main_job::training_set::RANDOM_TRACKS;
 use crate::observer::Observer;
 use crate::simulator::Track;
 
-/// Compare splits, colour spaces, what makes the wheel calm, or models: what a number promises beside what the drive delivers
+/// Trainings of each variant.
+const USUAL_SEEDS: u64 = 3;
+/// Random tracks that are trained on.
+const USUAL_RANDOM_TRACKS: u64 = 12;
+
+/// Compare splits, colour spaces, labels, what makes the wheel calm, or models: what a number promises beside what the drive delivers
 #[derive(Debug, Args)]
 pub struct ExperimentArgs {
     /// What is varied
     subject: SubjectArg,
     #[command(flatten)]
     recipe: RecipeArgs,
-    /// Trainings of each variant, with the seeds 1, 2, …
-    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=100))]
-    seeds: u64,
-    /// Track to drive; may be given several times [default: lake, forest, random:1000001]
+    /// Trainings of each variant, with the seeds 1, 2, … [default: 3; replay: 1]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=100))]
+    seeds: Option<u64>,
+    /// Track to drive; may be given several times [default: lake, forest, random:1000001; labels: lake,
+    /// mountain, random:1; replay: lake, which it also records]
     #[arg(long = "track", value_name = "TRACK")]
     tracks: Vec<String>,
     /// Runs on each track, of one lap
     #[arg(long, default_value_t = 2)]
     runs: usize,
-    /// Random tracks to train on, beside lake and mountain
-    #[arg(long, default_value_t = 12, value_name = "N", conflicts_with = "recordings",
+    /// Random tracks to train on, beside lake and mountain [default: 12]
+    #[arg(long, value_name = "N", conflicts_with = "recordings",
           value_parser = clap::value_parser!(u64).range(..=RANDOM_TRACKS))]
-    random_tracks: u64,
+    random_tracks: Option<u64>,
     /// Train on these recordings instead of the simulator's
     #[arg(long = "recording", value_name = "RECORDING")]
     recordings: Vec<PathBuf>,
@@ -48,7 +56,8 @@ pub struct ExperimentArgs {
     /// A first impression: one seed, 2 epochs, one run on one track
     #[arg(long, conflicts_with_all = ["seeds", "runs"])]
     quick: bool,
-    /// Save every trial as a line of this CSV file, which must not exist [default: runs/experiment-SUBJECT-N.csv]
+    /// Save every trial as a line of this CSV file, which must not exist; replay writes a page of the same name beside it
+    /// [default: runs/experiment-SUBJECT-N.csv]
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
     /// Memory for decoded images, in MiB
@@ -68,6 +77,9 @@ enum SubjectArg {
     Split,
     /// RGB, YUV, HSV, the saturation alone, grey
     Colour,
+    /// Labels from the recorded wheel, or from the driven path with look-aheads of 0.7, 1.0 and 1.3 s, where keys drove: by default on
+    /// a lap of lake in each direction, with the recipe `recording`; 12 trainings, about 12 minutes on two cores
+    Labels,
     /// Models of all qualities: does driving on a recording tell how they drive in the simulator?
     Replay,
     /// Averaged weights, terms of smoothness, blur before strides: what makes the wheel calm
@@ -79,25 +91,31 @@ pub fn run(args: ExperimentArgs) -> Result<()> {
         return Err(Error::Usage("--runs 0: at least 1 run is needed".into()));
     }
     if let SubjectArg::Replay = args.subject {
-        if !args.recordings.is_empty() {
-            return Err(Error::Usage("experiment replay makes recordings of its own; leave out --recording".into()));
-        }
+        refuse_what_replay_ignores(&args)?;
         args.tracks.iter().try_for_each(|track| Track::load(track).map(drop))?;
         let ExperimentArgs { tracks, quick, threads, json, cache: cache_mib, .. } = args;
         let runs = if quick { 1 } else { args.runs };
-        let replay = ReplayExperimentArgs { tracks, runs, quick, cache_mib, threads, json };
-        return experiment_replay::run(replay, &new_csv(args.out, args.subject)?);
+        let seeds = args.seeds.unwrap_or(1);
+        let replay = ReplayExperimentArgs { tracks, seeds, runs, quick, cache_mib, threads, json };
+        let out = new_csv(args.out, args.subject)?;
+        return experiment_replay::run(replay, &out, &page_of(&out));
     }
     let given = args.reading.expand(args.recordings)?;
     let held_out = held_out::check(&given, args.force_held_out)?;
     if !held_out.is_empty() {
         eprintln!("note: {}", trained_on_held_out(&held_out));
     }
-    let mut recipe = args.recipe.find()?;
-    let (seeds, runs) = if args.quick { (1, 1) } else { (args.seeds, args.runs) };
+    let labels = matches!(args.subject, SubjectArg::Labels);
+    if labels && args.random_tracks.is_some() {
+        return Err(Error::Usage("experiment labels trains on drives with keys; leave out --random-tracks".into()));
+    }
+    let mut recipe = args.recipe.find_or(if labels { "recording" } else { "default" })?;
+    let (seeds, runs) = if args.quick { (1, 1) } else { (args.seeds.unwrap_or(USUAL_SEEDS), args.runs) };
     let mut tracks = args.tracks;
     if tracks.is_empty() {
-        tracks = ["lake", "forest", "random:1000001"].map(String::from).to_vec();
+        // Held-out tracks must not choose the labels of a recipe.
+        let usual = if labels { ["lake", "mountain", "random:1"] } else { ["lake", "forest", "random:1000001"] };
+        tracks = usual.map(String::from).to_vec();
     }
     if args.quick {
         recipe.epochs = recipe.epochs.min(2);
@@ -110,10 +128,12 @@ pub fn run(args: ExperimentArgs) -> Result<()> {
     let (pool, mut display) = (pool(args.threads)?, JobDisplay::new(&stop));
     // A file that cannot be written is told before hours are spent.
     let out = new_csv(args.out, args.subject)?;
+    let scratch = tempfile::tempdir().map_err(Error::io(std::env::temp_dir()))?;
     let recordings = match given.is_empty() {
+        true if labels => pool.install(|| keyboard_drives(scratch.path(), &mut display, &stop)),
         true => {
-            let takes = labelled(&takes(args.random_tracks as usize), &recipe);
-            pool.install(|| training_set(RECORDINGS.as_ref(), &takes, &mut display, &stop))
+            let takes = takes(args.random_tracks.unwrap_or(USUAL_RANDOM_TRACKS) as usize);
+            pool.install(|| training_set(RECORDINGS.as_ref(), &takes, None, &mut display, &stop))
         }
         false => Ok(given),
     };
@@ -121,6 +141,7 @@ pub fn run(args: ExperimentArgs) -> Result<()> {
     let subject = match args.subject {
         SubjectArg::Split => Subject::Split,
         SubjectArg::Colour => Subject::Colour,
+        SubjectArg::Labels => Subject::Labels,
         SubjectArg::Replay => unreachable!("it has ended above"),
         SubjectArg::Smooth => Subject::Smooth,
     };
@@ -164,17 +185,48 @@ pub fn run(args: ExperimentArgs) -> Result<()> {
     result
 }
 
+/// Refuses what `experiment replay` would otherwise ignore: it makes its recordings and its models itself.
+fn refuse_what_replay_ignores(args: &ExperimentArgs) -> Result<()> {
+    let given = [
+        (!args.recordings.is_empty(), "--recording", "makes recordings of its own"),
+        (args.reading.is_given(), "what is said about recordings", "makes recordings of its own"),
+        (args.random_tracks.is_some(), "--random-tracks", "trains on the tracks that it drives (--track)"),
+        (args.recipe.is_given(), "--recipe and --set", "compares models of several recipes"),
+    ];
+    match given.into_iter().find(|(given, ..)| *given) {
+        Some((_, option, why)) => Err(Error::Usage(format!("experiment replay {why}; leave out {option}"))),
+        None => Ok(()),
+    }
+}
+
+/// The page beside the CSV file `csv` of `experiment replay`.
+fn page_of(csv: &Path) -> PathBuf {
+    csv.with_extension("html")
+}
+
 /// Creates the CSV file `out`, which must not exist, or else the first free one under `runs/`.
 fn new_csv(out: Option<PathBuf>, subject: SubjectArg) -> Result<PathBuf> {
     let name = match subject {
         SubjectArg::Split => "split",
         SubjectArg::Colour => "colour",
+        SubjectArg::Labels => "labels",
         SubjectArg::Replay => "replay",
         SubjectArg::Smooth => "smooth",
     };
     let of_number = |n: u32| PathBuf::from(format!("runs/experiment-{name}-{n}.csv"));
-    let out = out.unwrap_or_else(|| (1..).map(of_number).find(|path| !path.exists()).expect("numbers go on"));
+    // The page must not overwrite anything either.
+    let page = |csv: &Path| matches!(subject, SubjectArg::Replay).then(|| page_of(csv));
+    let is_free = |csv: &PathBuf| !csv.exists() && page(csv).is_none_or(|page| !page.exists());
+    let out = out.unwrap_or_else(|| (1..).map(of_number).find(is_free).expect("numbers go on"));
     refuse_existing(&out)?;
+    if let Some(page) = page(&out) {
+        if page == out {
+            let name = out.with_extension("csv");
+            let message = "the page of the experiment has this name; --out names the CSV file beside it, as in";
+            return Err(Error::Usage(format!("{}: {message} {}", out.display(), name.display())));
+        }
+        refuse_existing(&page)?;
+    }
     if let Some(parent) = out.parent() {
         std::fs::create_dir_all(parent).map_err(Error::io(parent))?;
     }

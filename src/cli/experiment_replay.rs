@@ -24,6 +24,8 @@ struct Report<'a> {
 pub(super) struct ReplayExperimentArgs {
     /// Tracks; `lake` if there are none.
     pub tracks: Vec<String>,
+    /// Seeds with which each model is trained.
+    pub seeds: u64,
     pub runs: usize,
     /// Three small models on short recordings.
     pub quick: bool,
@@ -32,13 +34,13 @@ pub(super) struct ReplayExperimentArgs {
     pub json: bool,
 }
 
-/// Runs the experiment; its rows go to `out`, which exists, and a page of the same name.
-pub(super) fn run(args: ReplayExperimentArgs, out: &Path) -> Result<()> {
+/// Runs the experiment; its rows go to `out`, which exists, and a page to `page`.
+pub(super) fn run(args: ReplayExperimentArgs, out: &Path, page: &Path) -> Result<()> {
     let stop = stop_on_ctrl_c()?;
     let (pool, mut display) = (pool(args.threads)?, JobDisplay::new(&stop));
     let tracks = if args.tracks.is_empty() { vec!["lake".into()] } else { args.tracks };
     let mut plan =
-        ReplayPlan { models: models(), tracks, laps: [1.0, 1.0], runs: args.runs, cache_mib: args.cache_mib };
+        ReplayPlan { models: models(args.seeds), tracks, laps: [1.0, 1.0], runs: args.runs, cache_mib: args.cache_mib };
     if args.quick {
         use replay_experiment::{Origin, Share};
         let of = 0;
@@ -49,7 +51,6 @@ pub(super) fn run(args: ReplayExperimentArgs, out: &Path) -> Result<()> {
         ];
         plan.laps = [0.3, 0.15];
     }
-    let page = out.with_extension("html");
     let mut done = Vec::new();
     let mut observer = |event| match event {
         ReplayExperimentEvent::Job(event) => display.observe(event),
@@ -64,7 +65,7 @@ pub(super) fn run(args: ReplayExperimentArgs, out: &Path) -> Result<()> {
         std::fs::remove_file(out).map_err(Error::io(out))?;
         return result;
     }
-    write_page(&page, &done)?;
+    write_page(page, &done)?;
     let found = RankCorrelations::of(&done);
     if args.json {
         print_json(&Report { rows: &done, rank_correlations: found })?;

@@ -39,6 +39,7 @@ mod share_bar;
 mod sim;
 mod summary;
 mod terminal;
+mod throttle;
 mod tracks;
 mod train;
 mod verdict;
@@ -225,6 +226,10 @@ struct RecipeArgs {
 }
 
 impl RecipeArgs {
+    fn is_given(&self) -> bool {
+        self.recipe.is_some() || !self.overrides.is_empty()
+    }
+
     fn find(&self) -> Result<Recipe> {
         self.find_or("default")
     }

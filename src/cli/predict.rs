@@ -7,8 +7,9 @@ use serde::Serialize;
 
 use super::{end_with, load_pilot, print, print_json};
 use crate::error::{Error, Result};
+use crate::pilot::Answer;
 
-/// Print the steering a model gives for images
+/// Print what a model gives for images: the steering, and throttle or speed if it has such an output
 #[derive(Debug, Args)]
 pub struct PredictArgs {
     /// Model file
@@ -16,17 +17,23 @@ pub struct PredictArgs {
     /// JPEG or PNG images
     #[arg(required = true, value_name = "IMAGE")]
     images: Vec<PathBuf>,
-    /// Print one JSON array as the last line: [{"image": …, "steering": …}, …], with "error" in the
-    /// place of "steering" where an image cannot be read
+    /// Print one JSON array as the last line: [{"image": …, "steering": …}, …], with "throttle", or "speed" (a share of the top speed)
+    /// and "speed_mph", of models that give one, and with "error" in the place of all that where an image cannot be read
     #[arg(long)]
     json: bool,
 }
 
-#[derive(Serialize)]
-struct Answer {
+#[derive(Default, Serialize)]
+struct Row {
     image: PathBuf,
     #[serde(skip_serializing_if = "Option::is_none")]
     steering: Option<f32>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    throttle: Option<f32>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    speed: Option<f32>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    speed_mph: Option<f32>,
     #[serde(skip_serializing_if = "Option::is_none")]
     error: Option<String>,
 }
@@ -34,19 +41,24 @@ struct Answer {
 pub fn run(args: PredictArgs) -> Result<()> {
     let mut pilot = load_pilot(&args.model)?;
     let full_lock_deg = pilot.recipe().full_lock_deg;
-    let (mut answers, mut failed): (Vec<Answer>, Vec<Error>) = Default::default();
+    let top_speed_mph = pilot.recipe().outputs.top_speed_mph().unwrap_or_default() as f32;
+    let (mut answers, mut failed): (Vec<Row>, Vec<Error>) = Default::default();
     for image in args.images {
-        match pilot.steer_file(&image) {
-            Ok(steering) => {
+        match pilot.answer_file(&image) {
+            Ok(Answer { steering, throttle, speed }) => {
+                let speed_mph = speed.map(|share| share * top_speed_mph);
                 if !args.json {
                     let angle_deg = f64::from(steering) * full_lock_deg;
-                    print(&format!("{steering:+.4}  {angle_deg:+6.2} deg  {}\n", image.display()))?;
+                    let throttle = throttle.map_or(String::new(), |throttle| format!("  throttle {throttle:+.4}"));
+                    let speed = speed_mph.map_or(String::new(), |mph| format!("  {mph:5.2} mph"));
+                    print(&format!("{steering:+.4}  {angle_deg:+6.2} deg{throttle}{speed}  {}\n", image.display()))?;
                 }
-                answers.push(Answer { image, steering: Some(steering), error: None });
+                let steering = Some(steering);
+                answers.push(Row { image, steering, throttle, speed, speed_mph, error: None });
             }
             // The other pictures are looked at all the same.
             Err(error) => {
-                answers.push(Answer { image, steering: None, error: Some(error.to_string()) });
+                answers.push(Row { image, error: Some(error.to_string()), ..Row::default() });
                 failed.push(error);
             }
         }

@@ -144,13 +144,14 @@ impl TrainingDisplay {
         }
         self.last_line = Instant::now();
         self.print(&format!(
-            "epoch {:>2}/{of}  loss {:.4}  val {}  centre {}  MAE {} deg  {} of zero's  {:.0} images/s  {:.1} s",
+            "epoch {:>2}/{of}  loss {:.4}  val {}  centre {}  MAE {} deg  {} of zero's{}  {:.0} images/s  {:.1} s",
             record.epoch,
             record.train_loss,
             or_dash(record.val_mse, 4),
             or_dash(record.val_center_mse, 4),
             or_dash(record.val_mae_deg, 2),
             or_dash(record.relative_to_zero, 2),
+            beside_steering(record.val_throttle_mae, record.val_speed_mae_mph),
             record.images as f64 / record.train_seconds,
             record.seconds,
         ));
@@ -158,6 +159,13 @@ impl TrainingDisplay {
             self.finish();
         }
     }
+}
+
+/// The mean absolute error of the output beside the steering, if there is one.
+pub(super) fn beside_steering(throttle_mae: Option<f64>, speed_mae_mph: Option<f64>) -> String {
+    let throttle = throttle_mae.map_or(String::new(), |mae| format!("  throttle MAE {mae:.3}"));
+    let speed = speed_mae_mph.map_or(String::new(), |mae| format!("  speed MAE {mae:.2} mph"));
+    throttle + &speed
 }
 
 /// Shows a main job on standard error: its training runs, and a bar for each of its other parts.

@@ -19,7 +19,7 @@ pub struct RecordArgs {
     #[arg(long)]
     track: String,
     /// Drive yourself, with keyboard, mouse or gamepad, on a page in a browser of this machine; Ctrl-C ends and saves
-    #[arg(long, conflicts_with_all = ["laps", "recovery", "style", "noise", "threads"])]
+    #[arg(long, conflicts_with_all = ["laps", "recovery", "style", "noise", "threads", "slower_in_bends"])]
     manual: bool,
     /// Port of the page, on this machine only; 0 takes any free one
     #[arg(long, default_value_t = DEFAULT_PORT, requires = "manual")]
@@ -42,6 +42,9 @@ pub struct RecordArgs {
     /// Speed to hold, mph; with --manual the highest
     #[arg(long, default_value_t = 20.0, value_name = "MPH")]
     speed: f64,
+    /// Drive slower than --speed before and in bends, so that the car is pushed sideways by at most MPS2, m/s² [default: 2.5]
+    #[arg(long, value_name = "MPS2", num_args = 0..=1, require_equals = true, default_missing_value = "2.5")]
+    slower_in_bends: Option<f64>,
     /// Standard deviation of a disturbance of the steering that the labels do not show
     #[arg(long, default_value_t = 0.0)]
     noise: f64,
@@ -81,6 +84,7 @@ enum Format {
 pub fn run(args: RecordArgs) -> Result<()> {
     let track = Track::load(&args.track)?;
     let options = RecordOptions {
+        car: None,
         laps: args.laps,
         reverse: args.reverse,
         recovery: args.recovery,
@@ -90,13 +94,13 @@ pub fn run(args: RecordArgs) -> Result<()> {
         },
         seed: args.seed,
         speed_mph: args.speed,
+        bends_mps2: args.slower_in_bends,
         noise: args.noise,
         hz: args.hz,
         format: match args.format {
             Format::Sample => LogFormat::Sample,
             Format::V2 => LogFormat::V2,
         },
-        label_look_ahead_m: None,
     };
     if args.manual {
         return drive_by_hand(&args, &track, &options);

@@ -34,6 +34,11 @@ pub struct RecordingArgs {
 }
 
 impl RecordingArgs {
+    /// Whether anything was said.
+    pub fn is_given(&self) -> bool {
+        self.recursive || !self.said().is_empty()
+    }
+
     /// What was said.
     pub fn said(&self) -> Description {
         Description {

@@ -12,7 +12,7 @@ use super::model_arg::model_file;
 use super::recording_args::RecordingArgs;
 use super::share_bar::ShareBar;
 use super::video::tell_video;
-use super::{load_pilot, pool, print, print_json, refuse_existing, stop_on_ctrl_c};
+use super::{end_with, load_pilot, pool, print, print_json, refuse_existing, stop_on_ctrl_c};
 use crate::calm::Calm;
 use crate::error::{Error, Result};
 use crate::files::new_folder::NewFolder;
@@ -132,17 +132,24 @@ pub fn run(args: &ReplayArgs) -> Result<()> {
     }
     let other = other.map(|(name, wheel)| Ok((name, pool.install(|| timed(&|| drive.go(&wheel, name)))?.1)));
     let other: Option<(&str, ReplaySummary)> = other.transpose()?;
-    let warp = pool.install(|| side_camera_check(&log))?;
+    // What was driven is told, whatever fails now.
+    let mut failed = Vec::new();
+    let warp = pool.install(|| side_camera_check(&log));
+    let warp = warp.unwrap_or_else(|error| {
+        failed.push(error);
+        None
+    });
     if let Some(folder) = folder {
-        report::on_recording::write(&log, &runs, &summary, folder)?;
+        failed.extend(report::on_recording::write(&log, &runs, &summary, folder).err());
     }
     if let (Some(path), Some(run)) = (args.video, runs.first()) {
-        pool.install(|| drive.film(&at_wheel, args, run, path))?;
+        failed.extend(pool.install(|| drive.film(&at_wheel, args, run, path)).err());
     }
     if args.json {
         let (assumed_speed_mps, warp, against) =
             (log.assumed_speed_mps, warp.as_ref(), other.as_ref().map(|(_, summary)| summary));
-        return print_json(&Report { recording: args.on, summary: &summary, assumed_speed_mps, warp, against });
+        print_json(&Report { recording: args.on, summary: &summary, assumed_speed_mps, warp, against })?;
+        return end_with(failed);
     }
     let mut text = summary_text(args.model, &summary);
     if let Some((name, summary)) = &other {
@@ -151,8 +158,13 @@ pub fn run(args: &ReplayArgs) -> Result<()> {
     if let Some(mps) = log.assumed_speed_mps {
         text += &format!("note: the recording says no speed; {mps:.1} m/s was assumed\n");
     }
-    text += &warp.map_or("note: without side cameras the warped views cannot be checked\n".into(), warp_text);
-    print(&text)
+    let unchecked = || match failed.is_empty() {
+        true => "note: without side cameras the warped views cannot be checked\n".into(),
+        false => String::new(),
+    };
+    text += &warp.map_or_else(unchecked, warp_text);
+    print(&text)?;
+    end_with(failed)
 }
 
 /// A drive at one latency of several; what `--json` prints of it.

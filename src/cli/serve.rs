@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 
+use super::throttle::Throttle;
 use super::{load_pilot, or_dash, print_json, stop_on_ctrl_c};
 use crate::error::{Error, Result};
 use crate::observer::Observer;
@@ -20,9 +21,12 @@ use crate::udacity;
 pub struct ServeArgs {
     /// Model file
     model: PathBuf,
-    /// Speed to hold, mph
+    /// Speed to hold, mph; with --throttle model the highest
     #[arg(long, default_value_t = 15.0, value_name = "MPH")]
     speed: f64,
+    /// Who gives the throttle: a controller that holds --speed, or the model, by its output `throttle` or `speed`
+    #[arg(long, value_enum, default_value_t = Throttle::Hold)]
+    throttle: Throttle,
     /// Drive slower than --speed where much steering is needed
     #[arg(long)]
     slower_in_bends: bool,
@@ -57,10 +61,12 @@ pub fn run(args: ServeArgs) -> Result<()> {
         return Err(Error::Usage(format!("--smooth {}: 0 to 1000 ms are meant", args.smooth)));
     }
     let pilot = load_pilot(&args.model)?;
+    args.throttle.check(&pilot, &args.model.display().to_string())?;
     let server = Server::bind(ServerOptions {
         address: SocketAddr::new(args.host, args.port),
         helm: HelmOptions {
             speed_mph: args.speed,
+            pace_of_model: args.throttle == Throttle::Model,
             slower_in_bends: args.slower_in_bends,
             smooth_s: args.smooth / 1000.0,
         },

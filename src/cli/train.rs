@@ -9,18 +9,19 @@ use steersman_kernels::Isa;
 use steersman_kernels::conv::ConvAlgorithm;
 
 use super::model_arg::model_file;
-use super::progress::JobDisplay;
+use super::progress::{self, JobDisplay};
 use super::recording_args::RecordingArgs;
 use super::verdict;
 use super::words::counted;
 use super::{RecipeArgs, or_dash, pool, print_json, stop_on_ctrl_c};
 use crate::dataset::held_out::{self, trained_on_held_out};
 use crate::error::{Error, Result};
-use crate::main_job::dagger_on_log::{self, Round};
-use crate::main_job::job::{Job, JobEvent, JobNote, JobRequest, Scope};
+use crate::main_job::dagger_on_log::{self, DaggerNote, Round};
+use crate::main_job::job::{Job, JobEvent, JobNote, JobRequest, RECORDINGS, Scope};
 use crate::main_job::on_recording::judge_run;
-use crate::main_job::{MainJobResult, TrackResult};
-use crate::observer::Observer;
+use crate::main_job::with_simulator::simulator_set;
+use crate::main_job::{MainJobResult, TrackResult, training_set};
+use crate::observer::{Observer, StopSignal};
 use crate::recipe::Recipe;
 use crate::replay::RecordingVerdict;
 use crate::report;
@@ -44,6 +45,10 @@ pub struct TrainArgs {
     /// Validate on this recording, whole, instead of on a share of the rows; may be given several times
     #[arg(long, value_name = "RECORDING", requires = "recordings")]
     validate: Vec<PathBuf>,
+    /// Train on the simulator's set as well, as the recording's camera sees it; it is recorded under data/recordings/ first if it is
+    /// not there. SHARE of each epoch's images are the simulator's [default: samples.simulator_share of the recipe, 0.5]
+    #[arg(long, value_name = "SHARE", num_args = 0..=1, require_equals = true, requires = "recordings", conflicts_with = "resume")]
+    with_simulator: Option<Option<f64>>,
     #[command(flatten)]
     reading: RecordingArgs,
     #[command(flatten)]
@@ -164,26 +169,43 @@ pub fn run(args: TrainArgs) -> Result<()> {
     }
     let mut display = JobDisplay::new(&stop);
     let mut rounds = Vec::new();
-    let (folder, result) = match args.resume {
+    let (folder, note, result) = match args.resume {
         Some(folder) => {
+            let note = DaggerNote::read(&folder)?;
             let moved = (!args.moved.is_empty()).then_some(&args.moved[..]);
             let mut observer = |event| display.observe(JobEvent::Training(event));
             let result = pool.install(|| training::resume_with(&folder, moved, args.profile, &mut observer, &stop));
-            (folder, result)
+            (folder, note, result)
         }
         None => {
-            let recipe = recipe()?;
+            let mut recipe = recipe()?;
+            if let Some(Some(share)) = args.with_simulator {
+                recipe.samples.simulator_share = share;
+                recipe.samples.validate()?;
+            }
             let recordings = args.reading.expand(args.recordings)?;
             let held_out = held_out::check(&recordings, args.force_held_out)?;
             if !held_out.is_empty() {
                 eprintln!("note: {}", trained_on_held_out(&held_out));
             }
             let validate = args.reading.expand(args.validate)?;
+            let simulator = match args.with_simulator {
+                Some(_) => {
+                    let (of_user, said, takes) =
+                        ([&recordings[..], &validate].concat(), args.reading.said(), training_set::takes());
+                    let set = || simulator_set(RECORDINGS.as_ref(), &takes, &of_user, &said, &mut display, &stop);
+                    let set = pool.install(set);
+                    display.finish();
+                    explain_stop(set, None)?
+                }
+                None => Vec::new(),
+            };
             let (out, claimed) = out_or_next(args.out, &recipe.name)?;
             let request = TrainRequest {
                 recordings,
                 validate,
                 also: Vec::new(),
+                simulator,
                 said: args.reading.said(),
                 recipe,
                 out: out.clone(),
@@ -193,47 +215,79 @@ pub fn run(args: TrainArgs) -> Result<()> {
                 profile: args.profile,
                 algorithm: args.algorithm,
             };
+            let note = (args.dagger > 0).then_some(DaggerNote { rounds: args.dagger, round: 0 });
             let free = (1..=args.dagger).try_for_each(|round| dagger_on_log::require_free(&out, round));
+            let noted = free.and_then(|()| note.iter().try_for_each(|note| note.write(&out)));
             let mut observer = |event| display.observe(JobEvent::Training(event));
-            let train = || training::train(request.clone(), &mut observer, &stop);
-            let result = claimed.settle(free.and_then(|()| pool.install(train)));
-            let result = result.and_then(|result| {
-                if args.dagger > 0 {
-                    pool.install(|| judge_or_say(&out));
-                    dagger_on_log::rounds(&out, args.dagger, &request, &mut display, &stop, &mut rounds)?;
+            let train = || {
+                let result = training::train(request, &mut observer, &stop);
+                if result.is_err() && note.is_some() {
+                    DaggerNote::take_back(&out);
                 }
-                Ok(result)
-            });
-            (out, result)
+                result
+            };
+            let result = claimed.settle(noted.and_then(|()| pool.install(train)));
+            (out, note, result)
         }
     };
+    // Where `--resume` goes on after a stop.
+    let mut at = folder.clone();
+    let result = result.and_then(|result| {
+        if let Some(note) = note.as_ref().filter(|note| note.round < note.rounds) {
+            pool.install(|| judge_or_say(&folder, &stop));
+            pool.install(|| dagger_on_log::rounds(note, args.profile, &mut display, &stop, &mut at, &mut rounds))?;
+        }
+        Ok(result)
+    });
     display.finish();
+    let result = pool.install(|| explain_stop(result, Some(&at)))?;
     let last = rounds.last().map_or(&folder, |round: &Round| &round.folder).clone();
-    let result = pool.install(|| explain_stop(result, Some(&last)))?;
-    let first = (args.dagger > 0).then(|| RunFolder::open(&folder)?.replay()).transpose()?.flatten();
     let (result, verdict) = match rounds.last() {
         Some(round) => (round.training.clone(), Some(round.verdict.clone())),
-        None => (result, pool.install(|| judge_or_say(&folder))),
+        None => (result, pool.install(|| judge_or_say(&folder, &stop))),
     };
     pool.install(|| write_report(&last));
-    let by_round: Vec<&RecordingVerdict> = first.iter().chain(rounds.iter().map(|round| &round.verdict)).collect();
+    let by_round = note.as_ref().map_or(Ok(Vec::new()), |note| verdicts(note, &folder, &rounds))?;
+    let by_round: Vec<&RecordingVerdict> = by_round.iter().collect();
     if args.json {
-        let dagger = if args.dagger > 0 { &by_round[..] } else { &[] };
-        return print_json(&Report { training: &result, on_recording: verdict.as_ref(), dagger });
+        print_json(&Report { training: &result, on_recording: verdict.as_ref(), dagger: &by_round })?;
+        return stop.check();
     }
     print_training(&result);
     if let Some(verdict) = verdict {
         super::print(&verdict::table(&verdict, result.best_epoch))?;
     }
-    if args.dagger > 0 {
+    if !by_round.is_empty() {
         super::print(&verdict::rounds(&by_round))?;
     }
-    Ok(())
+    // Judging may have been stopped.
+    stop.check()
 }
 
-/// Judges the model of the run in `folder` on its recordings. The run is saved; a judgement that cannot be made takes nothing from it.
-fn judge_or_say(folder: &Path) -> Option<RecordingVerdict> {
-    judge_run(folder).inspect_err(|error| eprintln!("note: the model was not judged on the recording: {error}")).ok()
+/// What the models of the first training and of all rounds are worth, where the folder of one of them is `folder` with the note `note`;
+/// `done` are the rounds of this time.
+fn verdicts(note: &DaggerNote, folder: &Path, done: &[Round]) -> Result<Vec<RecordingVerdict>> {
+    let of_round = |round| {
+        let folder = note.folder(folder, round)?;
+        match done.iter().find(|round| round.folder == folder) {
+            Some(round) => Ok(Some(round.verdict.clone())),
+            None => RunFolder::open(&folder)?.replay(),
+        }
+    };
+    (0..=note.rounds).filter_map(|round| of_round(round).transpose()).collect()
+}
+
+/// Judges the model of the run in `folder` on its recordings. The run is saved; a judgement that cannot be made, or that `stop` ends,
+/// takes nothing from it.
+fn judge_or_say(folder: &Path, stop: &StopSignal) -> Option<RecordingVerdict> {
+    let say = |error: &Error| match error {
+        Error::Interrupted => eprintln!(
+            "stopped; the run is saved, but the model was not judged on the recording: steersman train --resume {} does that",
+            folder.display()
+        ),
+        error => eprintln!("note: the model was not judged on the recording: {error}"),
+    };
+    judge_run(folder, stop).inspect_err(say).ok()
 }
 
 /// What the main job is going to do, and about how long it takes on `threads` threads.
@@ -319,8 +373,12 @@ const MUCH_LEAK: f64 = 3.0;
 fn print_training(result: &TrainResult) {
     let twins = result.near_twin_percent.unwrap_or(0.0);
     let leak = result.leak_percent.max(twins);
+    let simulator = match result.simulator_images {
+        0 => String::new(),
+        images => format!(", {images} of them the simulator's,"),
+    };
     println!(
-        "trained on {} images for {} in {:.1} s ({:.0} images/s); {} validation images, leak {} %",
+        "trained on {} images{simulator} for {} in {:.1} s ({:.0} images/s); {} validation images, leak {} %",
         result.train_images,
         counted(result.epochs as usize, "epoch"),
         result.seconds,
@@ -337,12 +395,13 @@ fn print_training(result: &TrainResult) {
         );
     }
     println!(
-        "epoch {}: validation MSE {}; centre camera {}, MAE {} deg, {} of the error of predicting zero",
+        "epoch {}: validation MSE {}; centre camera {}, MAE {} deg, {} of the error of predicting zero{}",
         result.best_epoch,
         or_dash(result.val_mse, 4),
         or_dash(result.val_center_mse, 4),
         or_dash(result.val_mae_deg, 2),
-        or_dash(result.relative_to_zero, 2)
+        or_dash(result.relative_to_zero, 2),
+        progress::beside_steering(result.val_throttle_mae, result.val_speed_mae_mph)
     );
     if !result.trained_on_held_out.is_empty() {
         println!("note: the model was {}", trained_on_held_out(&result.trained_on_held_out));

@@ -250,6 +250,14 @@ pub fn parse_columns(text: &str) -> Result<BTreeMap<Column, ColumnRef>, String> 
 }
 
 impl Description {
+    /// As it stands in `steersman.toml`.
+    ///
+    /// # Errors
+    /// [`Error::Fault`] if it cannot be written as TOML.
+    pub fn to_toml(&self) -> Result<String> {
+        toml::to_string(self).map_err(|e| Error::Fault(format!("cannot be written as TOML: {e}")))
+    }
+
     /// Whether nothing is said.
     pub fn is_empty(&self) -> bool {
         *self == Description::default()

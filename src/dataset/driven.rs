@@ -32,6 +32,14 @@ pub struct DrivenSessions {
     pub assumed_speed_mps: Option<f64>,
 }
 
+/// Speed at each row of `recording`, m/s: a row without one keeps the last one of its session, the first rows of a session take its
+/// first one. `None` if no row says a speed other than 0.
+pub(super) fn recorded_speeds_mps(recording: &Recording) -> Option<Vec<f64>> {
+    let driven = DrivenSessions::of(recording, recording.geometry.clone());
+    let speeds = driven.sessions.into_iter().flat_map(|session| session.speed_mps);
+    driven.assumed_speed_mps.is_none().then(|| speeds.collect())
+}
+
 impl DrivenSessions {
     /// Dead reckoning from the steering, speed and time of the rows of `recording`.
     pub fn of(recording: &Recording, geometry: CarGeometry) -> DrivenSessions {

@@ -243,3 +243,16 @@ fn the_log_variants_parse_without_their_images() {
     counts.sort_unstable();
     assert_eq!(counts, [149, 149, 150, 150, 150, 150, 150, 150]);
 }
+
+#[test]
+fn a_person_takes_over_only_where_a_model_drove_too() {
+    let folder = tempfile::tempdir().unwrap();
+    let taken_over = |modes: [&str; 4]| -> Vec<bool> {
+        let rows = modes.map(|mode| format!("a.jpg,,,0.1,1,0,9,{mode}\n")).concat();
+        log(folder.path(), &format!("center,left,right,steering,throttle,brake,speed,mode\n{rows}"));
+        believed(folder.path()).unwrap().rows.iter().map(|row| row.taken_over).collect()
+    };
+    assert_eq!(taken_over(["pilot", "user", "user", "pilot"]), [false, true, true, false]);
+    assert_eq!(taken_over(["user"; 4]), [false; 4]);
+    assert_eq!(taken_over(["pilot"; 4]), [false; 4]);
+}

@@ -7,7 +7,7 @@
 //!    training images ([`augment`]) and hands out batches.
 //!
 //! Labels are steering in [-1, 1], + = right. Side cameras and shifts move them, mirrors negate them; they are never
-//! clamped. [`leak`] measures what the training side gives away of the validation side, [`inspect`] describes a
+//! clamped. A recipe may ask for a second label, throttle or speed ([`Outputs`]), which nothing of that touches. [`leak`] measures what the training side gives away of the validation side, [`inspect`] describes a
 //! recording for people.
 
 mod description;
@@ -35,8 +35,8 @@ pub use recording::{Recording, Row, SESSION_GAP_MS, View};
 pub use rows::ImageCheck;
 pub(crate) use rows::{LeftOut, NO_NUMBER};
 pub use samples::{
-    Balance, Correction, Flip, Group, Item, LabelKind, LabelSpec, Mirror, SampleSpec, Targets, augment, leak, loader,
-    split, takeover, whole,
+    Balance, Correction, Flip, Group, Item, LabelKind, LabelSpec, Mirror, OutputKind, OutputSpec, Outputs, SampleSpec,
+    Targets, augment, leak, loader, split, takeover, whole,
 };
 pub use unusable::{Reason, Tally, Unusable};
 

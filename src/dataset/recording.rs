@@ -57,7 +57,8 @@ pub struct Row {
     pub brake: f32,
     /// Speed in miles per hour. NaN where it was not recorded.
     pub speed_mph: f32,
-    /// Whether a person took the wheel from a model that drove: the log has a column `mode` that says `user`.
+    /// Whether a person took the wheel from a model that drove: the log has a column `mode` that says `user`, and
+    /// something else in other rows.
     pub taken_over: bool,
     /// Whether a person has left it out; such rows are in a recording only if they were asked for.
     pub(crate) excluded: bool,

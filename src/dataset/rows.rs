@@ -352,12 +352,16 @@ impl Collected {
     /// The recording at `path`, whose files lie in `store`.
     /// `folder` is that of the log.
     pub fn into_recording(
-        self,
+        mut self,
         path: &Path,
         folder: PathBuf,
         store: Store,
         format: &'static Format,
     ) -> Result<Recording> {
+        // Who drove all of it took the wheel from nobody.
+        if self.rows.iter().all(|row| row.taken_over) {
+            self.rows.iter_mut().for_each(|row| row.taken_over = false);
+        }
         let camera = self.camera.unwrap_or_default();
         let geometry = camera.resolve(usual_preset(format.id))?;
         let notices = store.notice().into_iter().chain(self.notices).collect();

@@ -47,12 +47,44 @@ impl Loss {
     }
 }
 
+impl Loss {
+    /// As [`value_and_gradient`](Loss::value_and_gradient) for several outputs an image: predictions, labels and gradient are
+    /// `[n][weights.len()]`, and the loss of output `k` counts `weights[k]` times.
+    ///
+    /// # Panics
+    ///
+    /// Panics if the lengths differ, or are no multiple of the number of outputs.
+    pub fn weighted_value_and_gradient(
+        &self,
+        predictions: &[f32],
+        labels: &[f32],
+        weights: &[f32],
+        scale: f32,
+        gradient: &mut [f32],
+    ) -> f64 {
+        assert!(!weights.is_empty() && predictions.len().is_multiple_of(weights.len()), "an image is cut");
+        assert_eq!((predictions.len(), gradient.len()), (labels.len(), labels.len()));
+        let of_images = predictions.chunks_exact(weights.len()).zip(labels.chunks_exact(weights.len()));
+        let mut sum = 0.0;
+        for ((predictions, labels), gradient) in of_images.zip(gradient.chunks_exact_mut(weights.len())) {
+            for (k, weight) in weights.iter().enumerate() {
+                let of_output = k..k + 1;
+                let (predictions, labels) = (&predictions[of_output.clone()], &labels[of_output.clone()]);
+                let gradient = &mut gradient[of_output];
+                sum += f64::from(*weight) * self.value_and_gradient(predictions, labels, scale * weight, gradient);
+            }
+        }
+        sum
+    }
+}
+
 /// The `[smoothness]` table of a recipe: terms of the loss that punish answers which differ where they should not (after CAPS,
 /// Mysore et al. 2021). A wheel trembles by the differences between neighbouring frames, to which the mean squared error of single
 /// frames is blind.
 ///
 /// For the images a and b of a pair, with predictions f and labels y, the loss grows by
-/// `weight · mean over the pairs of ((f_a − f_b) − (y_a − y_b))²`. Differences are compared with those of the labels, so a pair may
+/// `weight · mean over the pairs of ((f_a − f_b) − (y_a − y_b))²`; of several outputs each has such a mean, times its weight in the
+/// loss. Differences are compared with those of the labels, so a pair may
 /// show different places, and a change that the labels ask for costs nothing.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -143,7 +175,8 @@ impl PairTerms {
     }
 
     /// Returns what the pairs among the images `images` of the batch add to the mean loss, and adds its derivative to `gradient`.
-    /// `predictions`, `labels` and `gradient` are those of `images`, `outputs` each.
+    /// `predictions`, `labels` and `gradient` are those of `images`, `outputs` each. `output_weights` are those of the outputs in the
+    /// loss; without any, each counts 1 / `outputs`.
     ///
     /// # Panics
     ///
@@ -152,10 +185,12 @@ impl PairTerms {
         &self,
         images: Range<usize>,
         outputs: usize,
+        output_weights: &[f32],
         predictions: &[f32],
         labels: &[f32],
         gradient: &mut [f32],
     ) -> f64 {
+        assert!(output_weights.is_empty() || output_weights.len() == outputs, "a weight for each output");
         let len = images.len() * outputs;
         assert_eq!((predictions.len(), labels.len(), gradient.len()), (len, len, len));
         let Pairs { spatial, temporal } = self.pairs;
@@ -168,10 +203,13 @@ impl PairTerms {
                 continue;
             }
             assert!(from.is_multiple_of(2) && to.is_multiple_of(2), "a pair of images {from} to {to} is cut");
-            let scale = weight / (count * outputs) as f64;
             for pair in (from..to).step_by(2) {
                 let (a, b) = ((pair - images.start) * outputs, (pair + 1 - images.start) * outputs);
                 for output in 0..outputs {
+                    let scale = match output_weights.get(output) {
+                        None => weight / (count * outputs) as f64,
+                        Some(of_output) => weight * f64::from(*of_output) / count as f64,
+                    };
                     let (a, b) = (a + output, b + output);
                     let difference = (predictions[a] - predictions[b]) - (labels[a] - labels[b]);
                     sum += scale * f64::from(difference * difference);
@@ -213,6 +251,25 @@ mod tests {
     }
 
     #[test]
+    fn outputs_count_by_their_weights() {
+        // Errors 0.5 and −3 of the first image, 1 and 0 of the second.
+        let (predictions, labels) = ([1.0, -3.0, 2.0, 0.5], [0.5, 0.0, 1.0, 0.5]);
+        let mut gradient = [f32::NAN; 4];
+        let loss = Loss::MeanSquaredError {};
+        let value = loss.weighted_value_and_gradient(&predictions, &labels, &[1.0, 0.25], 0.5, &mut gradient);
+        assert_eq!((value, gradient), (0.25 + 0.25 * 9.0 + 1.0, [0.5, -0.75, 1.0, 0.0]));
+        // One output of weight 1 has the bits of the plain loss.
+        let (mut plain, mut weighted) = ([f32::NAN; 4], [f32::NAN; 4]);
+        for loss in [loss, Loss::Huber { delta: 0.7 }] {
+            let values = [
+                loss.value_and_gradient(&predictions, &labels, 0.3, &mut plain),
+                loss.weighted_value_and_gradient(&predictions, &labels, &[1.0], 0.3, &mut weighted),
+            ];
+            assert_eq!((values[0].to_bits(), plain), (values[1].to_bits(), weighted));
+        }
+    }
+
+    #[test]
     fn pairs_share_the_batch() {
         let of = |spatial, temporal| Smoothness { spatial, temporal, ..Smoothness::default() };
         assert_eq!(of(0.0, 0.0).pairs(64), Pairs::default());
@@ -235,7 +292,7 @@ mod tests {
         let labels = [0.5, 0.0, 0.25, 1.0, 0.0, 0.0, -1.0, 0.5, 9.0, 9.0, 9.0, 9.0];
         let predictions = [1.0, 2.0, 0.25, 1.5, 0.0, 1.0, 1.0, 0.5, 1.0, 2.0, 3.0, 4.0];
         let mut gradient = [1.0; 12];
-        let value = terms.add(0..6, 2, &predictions, &labels, &mut gradient);
+        let value = terms.add(0..6, 2, &[], &predictions, &labels, &mut gradient);
         // Differences of the predictions less those of the labels: 0.75 − 0.25, 0.5 + 1; then −1 − 1, 0.5 + 0.5.
         let expected = 3.0 * (0.25 + 2.25) / 2.0 + 5.0 * (4.0 + 1.0) / 2.0;
         assert!((value - expected).abs() < 1e-12, "{value} is not {expected}");
@@ -243,7 +300,7 @@ mod tests {
             let shifted = |by: f32| {
                 let mut predictions = predictions;
                 predictions[at] += by;
-                terms.add(0..6, 2, &predictions, &labels, &mut [0.0; 12])
+                terms.add(0..6, 2, &[], &predictions, &labels, &mut [0.0; 12])
             };
             let slope = (shifted(0.125) - shifted(-0.125)) / 0.25;
             assert!((slope - f64::from(gradient[at] - 1.0)).abs() < 1e-5, "{at}: {slope}, {}", gradient[at]);
@@ -255,10 +312,19 @@ mod tests {
             .into_iter()
             .map(|images| {
                 let of = images.start * 2..images.end * 2;
-                terms.add(images, 2, &predictions[of.clone()], &labels[of.clone()], &mut parts[of])
+                terms.add(images, 2, &[], &predictions[of.clone()], &labels[of.clone()], &mut parts[of])
             })
             .sum();
         assert_eq!((sum, parts), (value, gradient));
+        // The outputs weigh 2 and 0.25 instead of 1/2 each.
+        let mut weighted = [0.0; 12];
+        let value = terms.add(0..6, 2, &[2.0, 0.25], &predictions, &labels, &mut weighted);
+        let expected = 3.0 * (2.0 * 0.25 + 0.25 * 2.25) + 5.0 * (2.0 * 4.0 + 0.25 * 1.0);
+        assert!((value - expected).abs() < 1e-12, "{value} is not {expected}");
+        for (at, (weighted, plain)) in weighted.iter().zip(gradient).enumerate() {
+            let times = [4.0, 0.5][at % 2];
+            assert!((weighted - times * (plain - 1.0)).abs() < 1e-5, "{at}: {weighted}, {plain}");
+        }
     }
 
     #[test]
@@ -266,6 +332,6 @@ mod tests {
     fn a_pair_that_is_cut_is_a_mistake() {
         let terms =
             PairTerms::new(&Smoothness { spatial: 1.0, ..Smoothness::default() }, Pairs { spatial: 2, temporal: 0 });
-        terms.add(0..3, 1, &[0.0; 3], &[0.0; 3], &mut [0.0; 3]);
+        terms.add(0..3, 1, &[], &[0.0; 3], &[0.0; 3], &mut [0.0; 3]);
     }
 }

@@ -203,14 +203,14 @@ fn judge(
     let mut plan = InferencePlan::new(network, 1);
     let mut planes = vec![0; preprocessing.output_len()];
     let mut input = vec![0.0; preprocessing.output_len()];
+    let mut outputs = vec![0.0; network.output().len()];
     let mut pairs = Vec::new();
     for index in spread((0..frames.len()).collect(), count) {
         preprocessor.apply(&frames.images[index].pixels, &mut planes);
         preprocessing.to_input(&planes, &mut input);
-        let mut steering = [0.0];
         let x = ArrayView4::from_shape(network.input().batch(1), &input).expect("an image of the input's shape");
-        plan.run(network, parameters, x, ArrayViewMut1::from(&mut steering));
-        pairs.push((f64::from(steering[0]), f64::from(frames.labels[index])));
+        plan.run(network, parameters, x, ArrayViewMut1::from(&mut outputs));
+        pairs.push((f64::from(outputs[0]), f64::from(frames.labels[index])));
     }
     Ok(correlation(pairs.into_iter()))
 }

@@ -81,6 +81,11 @@ impl CarGeometry {
     /// Name of the preset for small cars that say nothing of their camera.
     pub const USUAL_SMALL: &str = "donkeycar";
 
+    /// That of the built-in simulator.
+    pub fn simulator() -> CarGeometry {
+        STEERSMAN
+    }
+
     /// Names of the presets, each with what it stands for.
     pub fn presets() -> impl Iterator<Item = (&'static str, &'static str)> {
         PRESETS.iter().map(|(name, about, _)| (*name, *about))

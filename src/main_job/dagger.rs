@@ -41,7 +41,7 @@ pub fn recordings(
     if !out.exists() {
         let new = NewFolder::create(out)?;
         let recorded = record_takes(&takes, new.unfinished(), observer, |track, take, folder, observer| {
-            let options = take.options();
+            let options = take.options(None);
             let samples = drive_and_label(track, &options, &mut pilot.clone(), expert_share(round))?;
             write_recording(track, &options, &samples, folder, observer).map(drop)
         });

@@ -7,21 +7,22 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 use serde_json::Value;
 
-use super::job::{JobEvent, test_on_tracks};
+use super::job::{JobEvent, observed, test_on_tracks};
 use super::{TrackResult, training_set};
-use crate::dataset::Description;
 use crate::dataset::colour::Colour;
 use crate::dataset::split::SplitMode;
+use crate::dataset::{Description, LabelKind, LabelSpec};
 use crate::engine::layers::{BlurSpec, ZeroPadSpec};
 use crate::engine::loss::Smoothness;
 use crate::engine::network::LayerSpec;
 use crate::engine::optimizer::AveragingSpec;
 use crate::error::{Error, Result};
 use crate::files::atomic_file;
-use crate::observer::{Observer, StopSignal};
+use crate::observer::{Observer, Parts, StopSignal};
 use crate::pilot::Pilot;
 use crate::recipe::Recipe;
-use crate::simulator::DriveOptions;
+use crate::simulator::car::expert::Style;
+use crate::simulator::{DriveOptions, RecordOptions, Track, record};
 use crate::training::{self, TrainRequest};
 
 /// The setting that an experiment varies.
@@ -31,6 +32,8 @@ pub enum Subject {
     Split,
     /// The colours that the network sees: RGB, YUV, HSV, the saturation alone, grey.
     Colour,
+    /// What labels are: the recorded wheel, or the steering that follows the driven path, with look-aheads of 0.7, 1.0 and 1.3 s.
+    Labels,
     /// What makes the wheel calm: the recipe as it is, averaged weights, each term of smoothness, blur before each stride, all of them.
     Smooth,
 }
@@ -38,6 +41,9 @@ pub enum Subject {
 /// Decay of the averaged weights, and weights of the smoothness terms, of [`Subject::Smooth`].
 const DECAY: f64 = 0.998;
 const TERM: f64 = 2.0;
+
+/// Seed of the first drive of [`keyboard_drives`]; far from those of the training set and of drives.
+const KEYBOARD_SEED: u64 = 701;
 
 impl Subject {
     /// The recipes to compare, each with its name, made from `base`.
@@ -63,6 +69,17 @@ impl Subject {
                 (name, recipe)
             })
             .to_vec(),
+            Subject::Labels => {
+                let labels = |kind, look_ahead_s| LabelSpec { kind, look_ahead_s, ..base.labels };
+                [
+                    ("wheel", labels(LabelKind::Wheel, base.labels.look_ahead_s)),
+                    ("path 0.7 s", labels(LabelKind::Path, 0.7)),
+                    ("path 1.0 s", labels(LabelKind::Path, 1.0)),
+                    ("path 1.3 s", labels(LabelKind::Path, 1.3)),
+                ]
+                .map(|(name, labels)| (name, Recipe { labels, ..base.clone() }))
+                .to_vec()
+            }
             Subject::Smooth => {
                 let plain = || Recipe { averaging: None, smoothness: None, ..base.clone() };
                 let averaging = Some(AveragingSpec::Ema { decay: DECAY, from_share: 0.0, refit_batches: 0 });
@@ -175,6 +192,33 @@ pub fn takes(random_tracks: usize) -> Vec<training_set::Take> {
     takes
 }
 
+/// Records what [`Subject::Labels`] trains on under `folder`: a lap of `lake` in each direction, driven with keys as people do.
+///
+/// # Errors
+///
+/// As [`record`]; [`Error::Interrupted`] if `stop` is requested.
+pub fn keyboard_drives(
+    folder: &Path,
+    observer: &mut (dyn Observer<JobEvent> + Send),
+    stop: &StopSignal,
+) -> Result<Vec<PathBuf>> {
+    let track = Track::load("lake")?;
+    observed("recording drives with keys".into(), observer, stop, |observer| {
+        let parts = Parts::new(vec![1.0; 2], observer);
+        let drive = |(number, reverse): (usize, bool)| {
+            let out = folder.join(if reverse { "lake-reverse" } else { "lake" });
+            let options = RecordOptions {
+                reverse,
+                style: Style::Keyboard,
+                seed: KEYBOARD_SEED + number as u64,
+                ..Default::default()
+            };
+            record(&track, &options, &out, &mut parts.part(number)).map(|_| out)
+        };
+        [false, true].into_iter().enumerate().map(drive).collect()
+    })
+}
+
 /// Trains and drives every variant of `plan` with every seed. Call it inside a rayon pool; runs are kept in a temporary folder only.
 ///
 /// # Errors
@@ -199,6 +243,7 @@ pub fn run(
                 recordings: plan.recordings.clone(),
                 validate: Vec::new(),
                 also: Vec::new(),
+                simulator: Vec::new(),
                 said: plan.said.clone(),
                 recipe: recipe.clone(),
                 out: folder.path().join(format!("{variant}-{seed}")),
@@ -279,7 +324,7 @@ mod tests {
     fn variants_differ_in_the_subject_alone_and_fit_every_shipped_network() {
         for (name, _) in crate::recipe::SHIPPED {
             let base = Recipe::find(name, &[]).unwrap();
-            for subject in [Subject::Split, Subject::Colour, Subject::Smooth] {
+            for subject in [Subject::Split, Subject::Colour, Subject::Labels, Subject::Smooth] {
                 for (variant, mut recipe) in subject.variants(&base) {
                     recipe
                         .network(steersman_kernels::Isa::PORTABLE)
@@ -287,11 +332,23 @@ mod tests {
                     recipe.split.mode = base.split.mode;
                     recipe.preprocessing.colour = base.preprocessing.colour;
                     (recipe.averaging, recipe.smoothness) = (base.averaging, base.smoothness);
+                    recipe.labels = base.labels;
                     recipe.layers.clone_from(&base.layers);
                     assert_eq!(recipe, base);
                 }
             }
         }
+    }
+
+    #[test]
+    fn labels_are_those_of_the_wheel_and_of_the_path_at_three_look_aheads() {
+        let base = Recipe::find("recording", &[]).unwrap();
+        let found: Vec<_> = (Subject::Labels.variants(&base).into_iter())
+            .map(|(name, recipe)| (name, recipe.labels.kind, recipe.labels.look_ahead_s))
+            .collect();
+        let path = LabelKind::Path;
+        let wheel = ("wheel", LabelKind::Wheel, 1.0);
+        assert_eq!(found, [wheel, ("path 0.7 s", path, 0.7), ("path 1.0 s", path, 1.0), ("path 1.3 s", path, 1.3)]);
     }
 
     #[test]

@@ -12,6 +12,7 @@ use super::{MainJobResult, TRACKS, TrackResult, dagger, test_on_track};
 use crate::dataset::Description;
 use crate::error::{Error, Result};
 use crate::files::checksums;
+use crate::geometry::CarGeometry;
 use crate::observer::{Observer, Parts, Progress, StopSignal};
 use crate::pilot::Pilot;
 use crate::recipe::Recipe;
@@ -170,13 +171,13 @@ impl<'a> Job<'a> {
         for round in 1..=self.note.dagger_rounds {
             RunFolder::require_free(&dagger_folder(&out, 0, round)?)?;
         }
-        let takes = training_set::labelled(&self.scope.takes, &recipe);
-        let recordings = training_set(&self.scope.recordings, &takes, self.observer, self.stop)?;
+        let recordings = training_set(&self.scope.recordings, &self.scope.takes, None, self.observer, self.stop)?;
         let profile = self.profile;
         let training = self.train(TrainRequest {
             recordings,
             validate: Vec::new(),
             also: Vec::new(),
+            simulator: Vec::new(),
             said: Description::default(),
             recipe,
             out,
@@ -238,10 +239,9 @@ impl<'a> Job<'a> {
         let folder = RunFolder::open(&path)?;
         let (info, recipe) = (folder.info()?, folder.recipe()?);
         let pilot = Pilot::load(&training.model)?;
-        let what = format!("the model drives, the expert labels (round {round})");
-        let takes = training_set::labelled(&self.scope.takes, &recipe);
+        let (what, takes) = (format!("the model drives, the expert labels (round {round})"), &self.scope.takes);
         let recorded = observed(what, self.observer, self.stop, |observer| {
-            dagger::recordings(&pilot, &takes, &path.join("dagger"), round, observer)
+            dagger::recordings(&pilot, takes, &path.join("dagger"), round, observer)
         })?;
         let algorithm = Some(info.conv_algorithm(&folder)?);
         let mut recordings = info.recordings;
@@ -256,6 +256,7 @@ impl<'a> Job<'a> {
             recordings,
             validate: Vec::new(),
             also: Vec::new(),
+            simulator: Vec::new(),
             said: Description::default(),
             recipe,
             out,
@@ -310,7 +311,7 @@ pub fn test_on_tracks<T: AsRef<str> + Sync>(
     })
 }
 
-/// The recordings of `takes` under `folder`, recorded now if they are not there.
+/// The recordings of `takes` under `folder`, recorded now as `car`, or as the simulator's own, if they are not there.
 ///
 /// # Errors
 ///
@@ -318,11 +319,12 @@ pub fn test_on_tracks<T: AsRef<str> + Sync>(
 pub fn training_set(
     folder: &Path,
     takes: &[Take],
+    car: Option<&CarGeometry>,
     observer: &mut (dyn Observer<JobEvent> + Send),
     stop: &StopSignal,
 ) -> Result<Vec<PathBuf>> {
     let (paths, reused) = observed("recording the expert".into(), observer, stop, |observer| {
-        training_set::recordings(folder, takes, observer)
+        training_set::recordings(folder, takes, car, observer)
     })?;
     let verb = if reused { "found" } else { "recorded" };
     let notice = format!("{verb} the training set of {} recordings under {}", paths.len(), folder.display());

@@ -7,6 +7,7 @@ pub mod job;
 pub mod on_recording;
 pub mod replay_experiment;
 pub mod training_set;
+pub mod with_simulator;
 
 use std::path::Path;
 

@@ -5,6 +5,7 @@ use std::path::Path;
 use super::job::write_json;
 use crate::dataset::{Item, View};
 use crate::error::Result;
+use crate::observer::StopSignal;
 use crate::picture::RgbImage;
 use crate::pilot::Pilot;
 use crate::replay::{RecordingVerdict, Side, judge};
@@ -15,8 +16,9 @@ use crate::training::{Data, RunFolder};
 ///
 /// # Errors
 ///
-/// As [`Pilot::load`] and [`judge`]; [`Error::Data`](crate::Error::Data) if the recordings cannot be read any more.
-pub fn judge_run(path: &Path) -> Result<RecordingVerdict> {
+/// As [`Pilot::load`] and [`judge`]; [`Error::Data`](crate::Error::Data) if the recordings cannot be read any more;
+/// [`Error::Interrupted`](crate::Error::Interrupted) if `stop` is requested.
+pub fn judge_run(path: &Path, stop: &StopSignal) -> Result<RecordingVerdict> {
     let folder = RunFolder::open(path)?;
     let (info, recipe) = (folder.info()?, folder.recipe()?);
     let pilot = Pilot::load(&folder.model())?;
@@ -26,7 +28,7 @@ pub fn judge_run(path: &Path) -> Result<RecordingVerdict> {
         let mut pilot = pilot.clone();
         Ok(move |picture: &RgbImage| pilot.steer(picture.view()))
     };
-    let verdict = judge(data.driven(), &sides, recipe.full_lock_deg, new_driver)?;
+    let verdict = judge(data.driven(), &sides, recipe.full_lock_deg, new_driver, stop)?;
     write_json(path, RunFolder::REPLAY, &verdict)?;
     Ok(verdict)
 }

@@ -28,6 +28,11 @@ use crate::training::{self, TrainRequest};
 /// Seed of the first recording to train on, and of the first to test on.
 const SEEDS: [u64; 2] = [501, 601];
 
+/// From one time to the next of the whole list, all seeds grow by this.
+const SEED_STEP: u64 = 10;
+/// Models of one time.
+const MODELS: usize = 23;
+
 /// How a model of the experiment is made.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Origin {
@@ -76,9 +81,14 @@ pub struct ReplayPlan {
 }
 
 /// The models of the whole experiment: trained ones of four recipes, long and short, on much and on little, and two good ones
-/// that are spoilt more and more.
-pub fn models() -> Vec<Origin> {
-    let trained = |recipe, epochs, seed, share| Origin::Trained { recipe, epochs, seed, share };
+/// that are spoilt more and more. All of it `seeds` times, each time with other seeds.
+pub fn models(seeds: u64) -> Vec<Origin> {
+    (0..seeds).flat_map(|number| models_of(SEED_STEP * number, MODELS * number as usize)).collect()
+}
+
+/// The models of one time: with `seed` more than the first time, spoilt ones of those that stand from number `first` on.
+fn models_of(seed: u64, first: usize) -> Vec<Origin> {
+    let trained = |recipe, epochs, of_model, share| Origin::Trained { recipe, epochs, seed: seed + of_model, share };
     let mut models = vec![
         trained("default", 4, 1, Share::Lap),
         trained("lenet", 6, 1, Share::Lap),
@@ -94,8 +104,8 @@ pub fn models() -> Vec<Origin> {
         trained("default", 2, 2, Share::Lap),
         trained("default", 6, 1, Share::Tenth),
     ];
-    models.extend([0.1, 0.2, 0.3, 0.45, 0.6].map(|noise| Origin::Spoilt { of: 0, noise }));
-    models.extend([0.02, 0.04, 0.06, 0.08, 0.12].map(|noise| Origin::Spoilt { of: 1, noise }));
+    models.extend([0.1, 0.2, 0.3, 0.45, 0.6].map(|noise| Origin::Spoilt { of: first, noise }));
+    models.extend([0.02, 0.04, 0.06, 0.08, 0.12].map(|noise| Origin::Spoilt { of: first + 1, noise }));
     models
 }
 
@@ -222,6 +232,7 @@ pub fn run(
                     recordings: trained[usize::from(*share == Share::Tenth)].clone(),
                     validate: Vec::new(),
                     also: Vec::new(),
+                    simulator: Vec::new(),
                     said: Description::default(),
                     recipe: Recipe::find(recipe, &[format!("epochs={epochs}")])?,
                     out: folder.join(format!("run-{number}")),
@@ -248,7 +259,7 @@ pub fn run(
                 let mut pilot = pilot.clone();
                 Ok(move |picture: &RgbImage| pilot.steer(picture.view()))
             };
-            let mut verdict = judge(recordings, &[side], pilot.recipe().full_lock_deg, new_driver)?;
+            let mut verdict = judge(recordings, &[side], pilot.recipe().full_lock_deg, new_driver, stop)?;
             let side = verdict.sides.remove(0);
             let (Some(replay), Some(wheel), Some(path)) =
                 (side.drive, side.wheel_relative_to_zero, side.path_relative_to_zero)
@@ -408,10 +419,16 @@ mod tests {
 
     #[test]
     fn there_are_at_least_twenty_models_and_their_names_differ() {
-        let models = models();
+        let models = models(3);
         let mut names: Vec<String> = models.iter().map(|origin| origin.name(&models)).collect();
         names.sort();
         names.dedup();
-        assert!(models.len() >= 20 && names.len() == models.len());
+        assert!(models.len() == 3 * MODELS && names.len() == models.len());
+        // A spoilt model is one of the same time.
+        for (number, model) in models.iter().enumerate() {
+            let Origin::Spoilt { of, .. } = model else { continue };
+            assert!(*of < number && of / MODELS == number / MODELS, "{number}");
+            assert!(matches!(models[*of], Origin::Trained { .. }));
+        }
     }
 }

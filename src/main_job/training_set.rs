@@ -8,8 +8,8 @@ use sha2::{Digest, Sha256};
 
 use crate::error::{Error, Result};
 use crate::files::new_folder::NewFolder;
+use crate::geometry::CarGeometry;
 use crate::observer::{Observer, Parts, Progress};
-use crate::recipe::Recipe;
 use crate::simulator::{RecordOptions, Track, record};
 
 /// Random tracks in the set. Variety of looks teaches more than laps: each is driven for a fraction of a lap.
@@ -36,9 +36,6 @@ pub struct Take {
     pub recovery: bool,
     /// Draws start, light and texture.
     pub seed: u64,
-    /// See [`RecordOptions::label_look_ahead_m`].
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub label_look_ahead_m: Option<f64>,
 }
 
 impl Take {
@@ -49,14 +46,14 @@ impl Take {
         format!("{}{direction}{kind}", self.track.replace(':', "-"))
     }
 
-    pub(super) fn options(&self) -> RecordOptions {
+    pub(super) fn options(&self, car: Option<&CarGeometry>) -> RecordOptions {
         RecordOptions {
             laps: self.laps,
             reverse: self.reverse,
             recovery: self.recovery,
             seed: self.seed,
             hz: HZ,
-            label_look_ahead_m: self.label_look_ahead_m,
+            car: car.cloned(),
             ..Default::default()
         }
     }
@@ -68,7 +65,7 @@ pub fn takes() -> Vec<Take> {
     let mut takes = Vec::new();
     let mut take = |track: &str, laps, reverse, recovery| {
         let seed = FIRST_SEED + takes.len() as u64;
-        takes.push(Take { track: track.into(), laps, reverse, recovery, seed, label_look_ahead_m: None });
+        takes.push(Take { track: track.into(), laps, reverse, recovery, seed });
     };
     for track in ["lake", "mountain"] {
         for (laps, recovery) in [(0.8, false), (0.4, true)] {
@@ -85,20 +82,16 @@ pub fn takes() -> Vec<Take> {
     takes
 }
 
-/// `takes` with the labels that `recipe` asks for.
-pub fn labelled(takes: &[Take], recipe: &Recipe) -> Vec<Take> {
-    let label_look_ahead_m = recipe.expert.map(|expert| expert.label_look_ahead_m);
-    takes.iter().map(|take| Take { label_look_ahead_m, ..take.clone() }).collect()
-}
-
-/// Everything that determines a set, as text: the same text gives the same pictures.
-fn settings(takes: &[Take]) -> Result<String> {
+/// Everything that determines a set recorded as `car`, as text: the same text gives the same pictures.
+fn settings(takes: &[Take], car: Option<&CarGeometry>) -> Result<String> {
     #[derive(Serialize)]
     struct Settings<'a> {
         version: &'a str,
         simulator: &'static str,
         hz: u64,
         tracks_hash: String,
+        #[serde(skip_serializing_if = "Option::is_none")]
+        car: Option<&'a CarGeometry>,
         take: &'a [Take],
     }
     let failed = |e: toml::ser::Error| Error::Fault(format!("the training set cannot be described: {e}"));
@@ -107,7 +100,7 @@ fn settings(takes: &[Take]) -> Result<String> {
         tracks.update(toml::to_string(&Track::load(&of_track[0].track)?.spec).map_err(failed)?);
     }
     let (version, tracks_hash) = (env!("CARGO_PKG_VERSION"), digits(tracks));
-    let settings = Settings { version, simulator: SIMULATOR, hz: HZ, tracks_hash, take: takes };
+    let settings = Settings { version, simulator: SIMULATOR, hz: HZ, tracks_hash, car, take: takes };
     toml::to_string(&settings).map_err(failed)
 }
 
@@ -116,7 +109,8 @@ fn digits(hash: Sha256) -> String {
     hash.finalize().iter().take(8).map(|byte| format!("{byte:02x}")).collect()
 }
 
-/// The recordings of `takes` under `folder`, in order; records them first if they do not exist. The flag is `true` if they
+/// The recordings of `takes` under `folder`, in order, recorded as `car`, or as the simulator's own; records them first if they do
+/// not exist. The flag is `true` if they
 /// existed.
 ///
 /// A set lies in a folder named after a hash of its settings. It is written under another name and renamed when it is
@@ -129,9 +123,10 @@ fn digits(hash: Sha256) -> String {
 pub fn recordings(
     folder: &Path,
     takes: &[Take],
+    car: Option<&CarGeometry>,
     observer: &mut (dyn Observer<Progress> + Send),
 ) -> Result<(Vec<PathBuf>, bool)> {
-    let settings = settings(takes)?;
+    let settings = settings(takes, car)?;
     let set = folder.join(format!("set-{}", digits(Sha256::new_with_prefix(&settings))));
     let paths: Vec<PathBuf> = takes.iter().map(|take| set.join(take.folder())).collect();
     if set.exists() {
@@ -144,7 +139,7 @@ pub fn recordings(
     }
     let new = NewFolder::create(&set)?;
     let recorded = record_takes(takes, new.unfinished(), observer, |track, take, folder, observer| {
-        record(track, &take.options(), folder, observer).map(drop)
+        record(track, &take.options(car), folder, observer).map(drop)
     });
     recorded.map_err(|error| new.explain(error))?;
     let side = new.unfinished().join("set.toml");
@@ -192,15 +187,9 @@ mod tests {
         let (mut renderer, mut frame) = (Renderer::default(), RgbFrame::default());
         for (name, recovery) in [("lake", false), ("mountain", true), ("random:1", false), ("random:2", true)] {
             let track = Track::load(name).unwrap();
-            let take = Take {
-                track: name.into(),
-                laps: 1.0,
-                reverse: recovery,
-                recovery,
-                seed: FIRST_SEED,
-                label_look_ahead_m: None,
-            };
-            let (variant, samples) = (Variant::new(track.world(), take.seed), drive_expert(&track, &take.options()));
+            let take = Take { track: name.into(), laps: 1.0, reverse: recovery, recovery, seed: FIRST_SEED };
+            let (variant, samples) =
+                (Variant::new(track.world(), take.seed), drive_expert(&track, &take.options(None)));
             for (k, sample) in samples.iter().enumerate() {
                 hash.update(sample.time_s.to_le_bytes());
                 hash.update(sample.steering.to_le_bytes());
@@ -243,14 +232,8 @@ mod tests {
     }
 
     fn few() -> Vec<Take> {
-        let take = |track: &str, recovery, seed| Take {
-            track: track.into(),
-            laps: 0.01,
-            reverse: true,
-            recovery,
-            seed,
-            label_look_ahead_m: None,
-        };
+        let take =
+            |track: &str, recovery, seed| Take { track: track.into(), laps: 0.01, reverse: true, recovery, seed };
         vec![take("lake", false, 1), take("lake", true, 2), take("random:4", false, 3)]
     }
 
@@ -271,38 +254,30 @@ mod tests {
     }
 
     #[test]
-    fn takes_are_labelled_as_the_recipe_asks_and_their_sets_lie_apart() {
-        let with = |overrides: &[&str]| {
-            let overrides: Vec<String> = overrides.iter().map(|text| text.to_string()).collect();
-            labelled(&few(), &Recipe::find("lenet", &overrides).unwrap())
-        };
-        assert_eq!(with(&[]), few());
-        let far = with(&["expert.label_look_ahead_m=10"]);
-        assert!(far.iter().all(|take| take.options().label_look_ahead_m == Some(10.0)));
-        assert!(!settings(&few()).unwrap().contains("label"), "sets of other recipes are called as they were");
-        assert_ne!(settings(&far).unwrap(), settings(&few()).unwrap());
-    }
-
-    #[test]
     fn a_set_is_recorded_once_and_one_that_lacks_something_is_an_error() {
         let folder = tempfile::tempdir().unwrap();
-        let (paths, reused) = recordings(folder.path(), &few(), &mut Unobserved).unwrap();
+        let (paths, reused) = recordings(folder.path(), &few(), None, &mut Unobserved).unwrap();
         assert!(!reused && paths.len() == 3 && paths.iter().all(|path| path.join("driving_log.csv").is_file()));
-        let again = recordings(folder.path(), &few(), &mut |_| panic!("nothing is to be recorded")).unwrap();
+        let again = recordings(folder.path(), &few(), None, &mut |_| panic!("nothing is to be recorded")).unwrap();
         assert_eq!(again, (paths.clone(), true));
         let other: Vec<Take> = few().into_iter().map(|take| Take { seed: take.seed + 10, ..take }).collect();
-        assert!(recordings(folder.path(), &other, &mut Unobserved).unwrap().0[0] != paths[0]);
+        assert!(recordings(folder.path(), &other, None, &mut Unobserved).unwrap().0[0] != paths[0]);
         std::fs::remove_file(paths[1].join("recording.toml")).unwrap();
-        let error = recordings(folder.path(), &few(), &mut Unobserved).unwrap_err().to_string();
+        let error = recordings(folder.path(), &few(), None, &mut Unobserved).unwrap_err().to_string();
         assert!(error.contains("recorded again"), "{error}");
     }
 
     #[test]
     fn what_is_stopped_or_refused_leaves_nothing_behind() {
         let folder = tempfile::tempdir().unwrap();
-        assert!(matches!(recordings(folder.path(), &few(), &mut |_| Err(Error::Interrupted)), Err(Error::Interrupted)));
+        assert!(matches!(
+            recordings(folder.path(), &few(), None, &mut |_| Err(Error::Interrupted)),
+            Err(Error::Interrupted)
+        ));
         let held_out = vec![Take { track: "coast".into(), ..few()[0].clone() }];
-        assert!(recordings(folder.path(), &held_out, &mut Unobserved).unwrap_err().to_string().contains("held out"));
+        assert!(
+            recordings(folder.path(), &held_out, None, &mut Unobserved).unwrap_err().to_string().contains("held out")
+        );
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
     }
 }

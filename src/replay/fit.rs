@@ -97,7 +97,7 @@ pub fn fit_camera(log: &ReplayLog) -> Result<Option<CameraFit>> {
     }))
 }
 
-fn triple(log: &ReplayLog, frames: &mut Frames, row: usize) -> Result<Option<Triple>> {
+fn triple<'a>(log: &ReplayLog<'a>, frames: &mut Frames<'a>, row: usize) -> Result<Option<Triple>> {
     let mut pixels = |camera| -> Result<Option<Vec<u8>>> {
         let picture = frames.get(log.recording, row, camera)?;
         let fits = log.recording.image_size == Some([picture.height, picture.width]);

@@ -57,28 +57,56 @@ impl<'a> ReplayLog<'a> {
     }
 }
 
-/// The pictures of a recording, decoded when they are needed; the last one is kept.
+/// The pictures of recordings, decoded when they are needed; the last one is kept.
 #[derive(Debug, Default)]
-pub struct Frames {
+pub struct Frames<'a> {
     file: Vec<u8>,
     image: RgbImage,
-    held: Option<(usize, View)>,
+    held: Option<(&'a Recording, usize, View)>,
 }
 
-impl Frames {
+impl<'a> Frames<'a> {
     /// The picture of `camera` at `row` of `recording`.
     ///
     /// # Errors
     ///
     /// [`Error::Io`] and [`Error::Data`] with its path if it cannot be read.
-    pub fn get(&mut self, recording: &Recording, row: usize, camera: View) -> Result<&RgbImage> {
-        if self.held != Some((row, camera)) {
+    pub fn get(&mut self, recording: &'a Recording, row: usize, camera: View) -> Result<&RgbImage> {
+        let is_held =
+            |(held, at, of): (&Recording, usize, View)| std::ptr::eq(held, recording) && (at, of) == (row, camera);
+        if !self.held.is_some_and(is_held) {
             self.held = None;
             recording.read_picture(row, camera, &mut self.file)?;
             let place = || recording.image_path(row, camera).unwrap_or_else(|| recording.path.clone());
             decode_rgb(&self.file, &mut self.image).map_err(|message| Error::data(place(), message))?;
-            self.held = Some((row, camera));
+            self.held = Some((recording, row, camera));
         }
         Ok(&self.image)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::dataset;
+    use crate::dataset::testing::jpeg;
+
+    #[test]
+    fn the_picture_that_is_kept_is_not_taken_for_that_of_another_recording() {
+        let scratch = tempfile::tempdir().unwrap();
+        let recordings = [("a", [200, 30, 30]), ("b", [30, 30, 200])].map(|(name, colour)| {
+            let folder = scratch.path().join(name);
+            std::fs::create_dir_all(folder.join("IMG")).unwrap();
+            std::fs::write(folder.join("IMG/center.jpg"), jpeg(16, 16, colour)).unwrap();
+            std::fs::write(folder.join("driving_log.csv"), "IMG/center.jpg,,,0.1,1,0,20\n".repeat(2)).unwrap();
+            dataset::load(&folder).unwrap()
+        });
+        let mut frames = Frames::default();
+        let mut red_above_blue = |number: usize, row: usize| {
+            let picture = frames.get(&recordings[number], row, View::Centre).unwrap();
+            picture.pixels[0] > picture.pixels[2]
+        };
+        let seen = [(0, 0), (1, 0), (0, 0), (0, 1), (1, 1), (1, 1)].map(|(number, row)| red_above_blue(number, row));
+        assert_eq!(seen, [true, false, true, true, false, false]);
     }
 }

@@ -28,12 +28,14 @@ pub struct ReplayOptions {
     pub latency_ms: f64,
     /// How far ahead the path is pursued by the steering that is shown beside the driver's.
     pub look_ahead: LookAhead,
+    /// Whether a frame whose picture cannot be read is left out, with the wheel as it was; otherwise it ends the drive.
+    pub leave_out_unreadable: bool,
 }
 
 impl ReplayOptions {
-    /// No latency, and the usual look-ahead.
+    /// No latency, the usual look-ahead, and every picture can be read.
     pub fn usual(geometry: &CarGeometry) -> ReplayOptions {
-        ReplayOptions { latency_ms: 0.0, look_ahead: LookAhead::usual(geometry) }
+        ReplayOptions { latency_ms: 0.0, look_ahead: LookAhead::usual(geometry), leave_out_unreadable: false }
     }
 
     /// Checks that it can be driven.
@@ -104,6 +106,8 @@ pub struct ReplayRun {
     pub time_s: f64,
     /// Sum of squared changes of the wheels' angle, deg²/s.
     pub whiteness_sum: f64,
+    /// Why a picture could not be read, for each frame that was left out for that.
+    pub unreadable: Vec<String>,
 }
 
 impl ReplayRun {
@@ -167,7 +171,7 @@ pub struct ReplaySummary {
 ///
 /// # Errors
 ///
-/// Pictures that cannot be read, and the errors of drivers and of `seen`.
+/// Pictures that cannot be read, unless they are left out, and the errors of drivers and of `seen`.
 pub fn replay<D>(
     log: &ReplayLog,
     options: &ReplayOptions,
@@ -205,8 +209,18 @@ fn drive_session(
         let offset = path.pose_at(at_m).unwrap_or_default().offset_to(pose);
         let row = nearest_row(session, at_m);
         let speed_mps = session.speed_mps[row].max(MIN_WHEELBASES_PER_S * geometry.wheelbase_m);
-        let view = eye.look(log, session, row, session.path.poses()[row].offset_to(pose))?;
-        let steering = f64::from(driver(view)?);
+        let view = match eye.look(log, session, row, session.path.poses()[row].offset_to(pose)) {
+            Ok(view) => Some(view),
+            Err(error) if options.leave_out_unreadable => {
+                run.unreadable.push(error.to_string());
+                None
+            }
+            Err(error) => return Err(error),
+        };
+        let steering = match view {
+            Some(view) => f64::from(driver(view)?),
+            None => last_steering.unwrap_or(0.0),
+        };
         let steering = if steering.is_finite() { steering.clamp(-1.0, 1.0) } else { 0.0 };
         if let Some(last) = last_steering {
             let change_deg = (steering - last) * geometry.full_lock_deg;
@@ -228,8 +242,10 @@ fn drive_session(
             speed_mps,
             put_back: std::mem::take(&mut put_back),
         };
-        seen(&ReplayFrame { view, session, moment })?;
-        run.moments.push(moment);
+        if let Some(view) = view {
+            seen(&ReplayFrame { view, session, moment })?;
+            run.moments.push(moment);
+        }
         on_the_way.push_back(steering);
         let in_force = on_the_way.pop_front().unwrap_or(steering);
         pose = pose.moved(speed_mps * dt_s, geometry.curvature(in_force));
@@ -257,14 +273,14 @@ fn nearest_row(session: &DrivenSession, at_m: f64) -> usize {
 
 /// Looks at the recorded world from beside the path.
 #[derive(Default)]
-struct Eye {
-    frames: Frames,
+struct Eye<'a> {
+    frames: Frames<'a>,
     view: RgbImage,
 }
 
-impl Eye {
+impl<'a> Eye<'a> {
     /// The view of a car at `offset` from where it was at `row` of the session: made of the picture of the nearest camera.
-    fn look(&mut self, log: &ReplayLog, session: &DrivenSession, row: usize, offset: Offset) -> Result<&RgbImage> {
+    fn look(&mut self, log: &ReplayLog<'a>, session: &DrivenSession, row: usize, offset: Offset) -> Result<&RgbImage> {
         let row = session.rows.start + row;
         let [left_m, right_m] = log.geometry.side_offsets_m;
         let (camera, taken_m) = [(View::Centre, 0.0), (View::Left, left_m), (View::Right, right_m)]

@@ -73,7 +73,7 @@ pub(super) fn rows_with_all_cameras(log: &ReplayLog, count: usize) -> Vec<usize>
 }
 
 /// Mean difference in grey levels of both side pictures from the warped and from the unwarped centre picture.
-fn errors(log: &ReplayLog, frames: &mut Frames, row: usize) -> Result<[f64; 2]> {
+fn errors<'a>(log: &ReplayLog<'a>, frames: &mut Frames<'a>, row: usize) -> Result<[f64; 2]> {
     let centre = frames.get(log.recording, row, View::Centre)?.clone();
     let grid = PixelGrid::whole(&log.geometry, [centre.height, centre.width]);
     let mut predicted = vec![0; centre.pixels.len()];

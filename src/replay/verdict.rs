@@ -13,6 +13,7 @@ use crate::dataset::{DrivenSessions, Recording, View};
 use crate::error::Result;
 use crate::geometry::LookAhead;
 use crate::metrics::{Metrics, Prediction};
+use crate::observer::StopSignal;
 use crate::picture::RgbImage;
 
 /// Rows of a side whose error is measured, spread over the side.
@@ -84,12 +85,13 @@ pub struct RecordingVerdict {
 ///
 /// # Errors
 ///
-/// Those of `new_driver`.
+/// Those of `new_driver`; [`Error::Interrupted`](crate::Error::Interrupted) if `stop` is requested.
 pub fn judge<D>(
     recordings: &[Recording],
     sides: &[Side],
     full_lock_deg: f64,
     new_driver: impl Fn() -> Result<D> + Sync,
+    stop: &StopSignal,
 ) -> Result<RecordingVerdict>
 where
     D: FnMut(&RgbImage) -> Result<f32>,
@@ -115,8 +117,8 @@ where
     for (number, side) in sides.iter().enumerate() {
         let other: Vec<(usize, usize)> =
             sides.iter().enumerate().filter(|(i, _)| *i != number).flat_map(|(_, side)| side.rows.clone()).collect();
-        let (wheel, path) = errors(recordings, side, &labels, full_lock_deg, &new_driver)?;
-        let (stretches, drive) = drive(recordings, side, &other, &new_driver, &mut verdict.notes)?;
+        let (wheel, path) = errors(recordings, side, &labels, full_lock_deg, &new_driver, stop)?;
+        let (stretches, drive) = drive(recordings, side, &other, &new_driver, &mut verdict.notes, stop)?;
         let (wheel_relative_to_zero, path_relative_to_zero) =
             (wheel.and_then(|m| m.relative_to_zero), path.and_then(|m| m.relative_to_zero));
         if let (Some(_), None) = (wheel, wheel_relative_to_zero) {
@@ -144,19 +146,21 @@ where
 }
 
 /// The errors against the wheel and against the path, on up to [`MAX_ROWS`] of the rows.
-fn errors<D>(
-    recordings: &[Recording],
+fn errors<'a, D>(
+    recordings: &'a [Recording],
     side: &Side,
     labels: &[Vec<Option<f32>>],
     full_lock_deg: f64,
     new_driver: &(impl Fn() -> Result<D> + Sync),
+    stop: &StopSignal,
 ) -> Result<(Option<Metrics>, Option<Metrics>)>
 where
     D: FnMut(&RgbImage) -> Result<f32>,
 {
     new_driver()?;
     let n = side.rows.len().min(MAX_ROWS);
-    let answer = |(driver, frames): &mut (Result<D>, Frames), k: usize| -> Option<[Option<Prediction>; 2]> {
+    let answer = |(driver, frames): &mut (Result<D>, Frames<'a>), k: usize| -> Option<[Option<Prediction>; 2]> {
+        stop.check().ok()?;
         let (number, row) = side.rows[k * side.rows.len() / n];
         let recording = &recordings[number];
         let picture = frames.get(recording, row, View::Centre).ok()?;
@@ -166,6 +170,7 @@ where
     };
     let answers: Vec<[Option<Prediction>; 2]> =
         (0..n).into_par_iter().map_init(|| (new_driver(), Frames::default()), answer).flatten().collect();
+    stop.check()?;
     let metrics = |kind: usize| {
         let predictions: Vec<Prediction> = answers.iter().filter_map(|answer| answer[kind]).collect();
         Metrics::of(&predictions, full_lock_deg)
@@ -180,6 +185,7 @@ fn drive<D>(
     other: &[(usize, usize)],
     new_driver: &(impl Fn() -> Result<D> + Sync),
     notes: &mut Vec<String>,
+    stop: &StopSignal,
 ) -> Result<(Vec<Stretch>, Option<ReplaySummary>)>
 where
     D: FnMut(&RgbImage) -> Result<f32>,
@@ -198,7 +204,7 @@ where
         let long = ReplayLog::of_stretches(recording, recording.geometry.clone(), &own);
         let lines = |rows: &Range<usize>| [rows.start, rows.end - 1].map(|row| recording.rows[row].line);
         let named = long.sessions.iter().map(|session| &session.rows).filter(|rows| shared(rows));
-        parts.extend(named.map(lines).map(|[first, last]| format!("{first}–{last}")));
+        parts.extend(named.map(lines).map(|[first, last]| format!("{first}–{last}{}", of_log(recordings, number))));
     }
     if pieces.is_empty() {
         let note = if any {
@@ -212,7 +218,8 @@ where
     if !parts.is_empty() {
         let more = if parts.len() > NAMED { format!(" and {} more", parts.len() - NAMED) } else { String::new() };
         let first = parts[..parts.len().min(NAMED)].join(", ");
-        notes.push(format!("{}: driven are its parts of the sessions, lines {first} of the log{more}", side.name));
+        let log = if recordings.len() == 1 { " of the log" } else { "" };
+        notes.push(format!("{}: driven are its parts of the sessions, lines {first}{log}{more}", side.name));
     }
     let length_s = |log: &ReplayLog| log.recording.session_s(&log.sessions[0].rows);
     let all_s: f64 = pieces.iter().map(length_s).sum();
@@ -230,7 +237,7 @@ where
     let driven: Vec<(Stretch, Result<ReplayRun>)> = pieces
         .par_iter()
         .map(|log| {
-            let run = replay(log, &ReplayOptions::usual(&log.geometry), new_driver, &|_, _| Ok(()));
+            let run = replay(log, &ReplayOptions::usual(&log.geometry), new_driver, &|_, _| stop.check());
             let rows = &log.sessions[0].rows;
             let lines = [rows.start, rows.end - 1].map(|row| log.recording.rows[row].line);
             let number = recordings.iter().position(|recording| std::ptr::eq(recording, log.recording));
@@ -238,6 +245,7 @@ where
             (stretch, run.map(|mut runs| runs.pop().unwrap_or_default()))
         })
         .collect();
+    stop.check()?;
     let seconds = began.elapsed().as_secs_f64();
     let (mut stretches, mut runs) = (Vec::new(), Vec::new());
     for (stretch, run) in driven {
@@ -248,12 +256,21 @@ where
             }
             Err(error) => {
                 let [first, last] = stretch.lines;
-                notes.push(format!("{}: lines {first}–{last} are not driven: {error}", side.name));
+                let of_log = of_log(recordings, stretch.recording);
+                notes.push(format!("{}: lines {first}–{last}{of_log} are not driven: {error}", side.name));
             }
         }
     }
     let summary = (!runs.is_empty()).then(|| summarise(&runs, seconds));
     Ok((stretches, summary))
+}
+
+/// Whose lines are meant: ` of PATH` where there are several recordings.
+fn of_log(recordings: &[Recording], number: usize) -> String {
+    match recordings {
+        [_] => String::new(),
+        _ => format!(" of {}", recordings[number].path.display()),
+    }
 }
 
 /// What can be driven of `side`: stretches of its rows between which there is none of `other`, in pieces of at most a minute, each a
@@ -301,4 +318,30 @@ fn cut(recording: &Recording, stretch: &Range<usize>) -> Vec<Range<usize>> {
     let n = (recording.session_s(stretch) / PIECE_S).ceil().max(1.0) as usize;
     let bound = |k: usize| stretch.start + k * stretch.len() / n;
     (0..n).map(|k| bound(k)..bound(k + 1)).filter(|piece| !piece.is_empty()).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::dataset::testing::recording_of;
+
+    #[test]
+    fn lines_are_those_of_a_named_log_where_there_are_several() {
+        let one = [recording_of(&[0.1; 4], 100)];
+        assert_eq!(of_log(&one, 0), "");
+        let mut two = [recording_of(&[0.1; 4], 100), recording_of(&[0.1; 4], 100)];
+        two[1].path = "b".into();
+        assert_eq!([0, 1].map(|number| of_log(&two, number)), [" of memory", " of b"]);
+    }
+
+    #[test]
+    fn judging_ends_on_request() {
+        let recordings = [recording_of(&[0.1; 40], 100)];
+        let side = Side { name: "training", rows: (0..40).map(|row| (0, row)).collect() };
+        let judged = |stop: &StopSignal| judge(&recordings, &[side.clone()], 25.0, || Ok(|_: &RgbImage| Ok(0.0)), stop);
+        let stop = StopSignal::default();
+        assert!(judged(&stop).is_ok());
+        stop.request();
+        assert!(matches!(judged(&stop), Err(crate::Error::Interrupted)));
+    }
 }

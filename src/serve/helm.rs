@@ -1,15 +1,18 @@
-//! Makes a command from the model's steering: smoothing, and a speed to hold.
+//! Makes a command from the model's answer: smoothing, and a speed to hold or to stay below.
 
 use std::time::{Duration, Instant};
 
+use crate::simulator::DriverAnswer;
 use crate::simulator::car::speed::{SpeedController, slower_in_bends_mph};
 use crate::udacity::Command;
 
 /// How the car is driven.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct HelmOptions {
-    /// Speed to hold, mph.
+    /// Speed to hold, mph; with `pace_of_model` the highest.
     pub speed_mph: f64,
+    /// Whether throttle or speed are the model's, as far as it gives one.
+    pub pace_of_model: bool,
     /// Whether to drive slower where the model steers much.
     pub slower_in_bends: bool,
     /// Time constant of the low-pass filter of the steering, s; 0 for none.
@@ -18,7 +21,7 @@ pub struct HelmOptions {
 
 impl Default for HelmOptions {
     fn default() -> Self {
-        HelmOptions { speed_mph: 15.0, slower_in_bends: false, smooth_s: 0.0 }
+        HelmOptions { speed_mph: 15.0, pace_of_model: false, slower_in_bends: false, smooth_s: 0.0 }
     }
 }
 
@@ -65,12 +68,13 @@ impl Helm {
         }
     }
 
-    /// The command for the frame of `time`: the model's output is `steering`, the car drives at `speed_mph`.
+    /// The command for the frame of `time`: the model's outputs are `answer`, the car drives at `speed_mph`.
     ///
     /// Steering that is not finite becomes 0. `drive` computes its commands in the same way; without smoothing and slowing
     /// down, a client on simulated time gets the same bits.
-    pub fn command(&mut self, steering: f32, speed_mph: f64, time: FrameTime) -> Command {
+    pub fn command_for(&mut self, answer: DriverAnswer, speed_mph: f64, time: FrameTime) -> Command {
         let time_s = self.seconds(time);
+        let DriverAnswer { steering, pace } = answer;
         let mut steering = if steering.is_finite() { steering.clamp(-1.0, 1.0) } else { 0.0 };
         if let Some(last_s) = self.last_s.filter(|_| self.options.smooth_s > 0.0) {
             let share = 1.0 - (-(time_s - last_s).max(0.0) / self.options.smooth_s).exp();
@@ -80,7 +84,10 @@ impl Helm {
         if self.options.slower_in_bends {
             target_mph = slower_in_bends_mph(target_mph, f64::from(steering));
         }
-        let throttle = self.controller.throttle_at(time_s, target_mph, speed_mph);
+        let throttle = match pace.filter(|_| self.options.pace_of_model) {
+            Some(pace) => self.controller.throttle_for(pace, time_s, target_mph, speed_mph),
+            None => self.controller.throttle_at(time_s, target_mph, speed_mph),
+        };
         self.last_s = Some(time_s);
         self.last_frame = Some((time, Instant::now()));
         self.last = Command { steering, throttle };
@@ -127,7 +134,15 @@ impl Helm {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::simulator::car::speed::Pace;
     use std::time::Duration;
+
+    impl Helm {
+        /// The command for a model that gives the steering alone.
+        fn command(&mut self, steering: f32, speed_mph: f64, time: FrameTime) -> Command {
+            self.command_for(DriverAnswer { steering, pace: None }, speed_mph, time)
+        }
+    }
 
     #[test]
     fn steering_is_clamped_and_not_finite_is_straight_ahead() {
@@ -151,6 +166,23 @@ mod tests {
             let throttle = by_arrival.command(0.0, mph, FrameTime::Arrival(start + Duration::from_millis(ms))).throttle;
             assert!((throttle - controller.throttle_at(ms as f64 / 1e3, 15.0, mph)).abs() < 1e-6);
         }
+    }
+
+    #[test]
+    fn the_models_pace_counts_only_if_wanted_and_up_to_the_limit() {
+        let answer = |pace| DriverAnswer { steering: 0.0, pace: Some(pace) };
+        let at = |pace_of_model, pace, mph| {
+            let mut helm = Helm::new(HelmOptions { pace_of_model, ..Default::default() });
+            helm.command_for(answer(pace), mph, FrameTime::Simulated(0.0)).throttle
+        };
+        let held = |target_mph: f64, mph: f64| SpeedController::default().throttle_at(0.0, target_mph, mph);
+        assert_eq!(at(true, Pace::Throttle(0.3), 10.0), 0.3);
+        assert_eq!(at(false, Pace::Throttle(0.3), 10.0), held(15.0, 10.0));
+        assert_eq!(at(true, Pace::Throttle(0.9), 16.0), -0.5);
+        assert_eq!(at(true, Pace::SpeedMph(12.0), 10.0), held(12.0, 10.0));
+        assert_eq!(at(true, Pace::SpeedMph(25.0), 10.0), held(15.0, 10.0));
+        let mut without = Helm::new(HelmOptions { pace_of_model: true, ..Default::default() });
+        assert_eq!(without.command(0.0, 10.0, FrameTime::Simulated(0.0)).throttle, held(15.0, 10.0));
     }
 
     #[test]

@@ -34,14 +34,17 @@ pub(crate) struct Sources<'a> {
     pub validate: &'a [PathBuf],
     /// Views that a model met, which are always trained on.
     pub also: &'a [PathBuf],
+    /// The simulator's set, of which each epoch draws some.
+    pub simulator: &'a [PathBuf],
 }
 
 /// Recordings that have been read and split.
 #[derive(Debug)]
 pub(crate) struct Data {
     recordings: Arc<[Recording]>,
-    /// The number of those that can be driven on.
+    /// The number of those that can be driven on, and of those before the simulator's.
     driven: usize,
+    simulated: usize,
     targets: Arc<Targets>,
     split: Split,
     leak: LeakAudit,
@@ -56,7 +59,8 @@ impl Data {
     ///
     /// As [`Data::prepare`].
     pub fn of_run(info: &RunInfo, recipe: &Recipe, cache_mib: usize) -> Result<Data> {
-        let sources = Sources { paths: &info.recordings, validate: &info.validate, also: &info.also };
+        let sources =
+            Sources { paths: &info.recordings, validate: &info.validate, also: &info.also, simulator: &info.simulator };
         Data::prepare(sources, &info.said, recipe, info.seed, cache_mib)
     }
 
@@ -67,7 +71,7 @@ impl Data {
     ///
     /// [`Error::Io`] and [`Error::Data`] for recordings that cannot be used, or if a side would be empty.
     pub fn prepare(
-        Sources { paths, validate, also }: Sources,
+        Sources { paths, validate, also, simulator }: Sources,
         said: &Description,
         recipe: &Recipe,
         seed: u64,
@@ -75,10 +79,10 @@ impl Data {
     ) -> Result<Data> {
         let mut recordings = Vec::new();
         let mut notices = Vec::new();
-        // What the user says of the recordings does not count for views, which steersman wrote itself.
-        let of_views = Description::default();
+        // What the user says of the recordings does not count for views and drives, which steersman wrote itself.
+        let of_own = Description::default();
         let of_user = paths.iter().chain(validate).map(|path| (path, said));
-        for (path, said) in of_user.chain(also.iter().map(|path| (path, &of_views))) {
+        for (path, said) in of_user.chain(also.iter().chain(simulator).map(|path| (path, &of_own))) {
             let mut recording = dataset::load_with(path, said, ImageCheck::Verify)?;
             recording.require_usable()?;
             recording.hash_pictures();
@@ -86,7 +90,10 @@ impl Data {
             recordings.push(recording);
         }
         let driven = paths.len() + validate.len();
-        let targets = recipe.targets(&recordings[..driven]);
+        let simulated = driven + also.len();
+        let [of_user, views, drives] =
+            [&recordings[..driven], &recordings[driven..simulated], &recordings[simulated..]];
+        let targets = recipe.targets(of_user, views, drives)?;
         notices.extend_from_slice(targets.notices());
         let mut split = match validate {
             [] => split(&recordings[..driven], &targets, &recipe.split, &recipe.samples, &recipe.balance, seed)?,
@@ -95,12 +102,21 @@ impl Data {
                 split_whole(of_split, paths.len(), &targets, &recipe.samples, &recipe.balance, seed)?
             }
         };
-        let targets = targets.with_views(&recordings[driven..], &recipe.labels);
-        split.train_on(&recordings, driven)?;
-        let taken_over = takeover::weigh(&mut split.training, &recordings, &recipe.samples, seed);
+        split.train_on(&recordings[..simulated], driven, &targets)?;
+        let taken_over = takeover::weigh(&mut split, &recordings, &recipe.samples, seed)?;
         if taken_over > 0 {
             let weight = recipe.samples.takeover_weight;
             split.notices.push(format!("{taken_over} training rows in which a person took over count {weight} times"));
+        }
+        if !simulator.is_empty() {
+            split.draw_from(&recordings, simulated, &targets, &recipe.samples, &recipe.balance, seed)?;
+            split.notices.push(format!(
+                "the simulator's set of {} recordings is trained on as well: of its {} rows each epoch draws so many images that \
+                 they are {:.0} % of it (samples.simulator_share)",
+                simulator.len(),
+                split.simulator.len(),
+                100.0 * recipe.samples.simulator_share
+            ));
         }
         notices.push(split.summary());
         let leak = LeakAudit::of(&split, &recordings);
@@ -117,7 +133,16 @@ impl Data {
                 folder: None,
             },
         };
-        Ok(Data { recordings: recordings.into(), driven, targets: targets.into(), split, leak, loader, notices })
+        Ok(Data {
+            recordings: recordings.into(),
+            driven,
+            simulated,
+            targets: targets.into(),
+            split,
+            leak,
+            loader,
+            notices,
+        })
     }
 
     /// Messages for the user about the recordings and the split.
@@ -125,9 +150,14 @@ impl Data {
         &self.notices
     }
 
-    /// The recordings, in the order of the command line.
+    /// The recordings, in the order of the command line; then views that a model met, then the simulator's.
     pub fn recordings(&self) -> &[Recording] {
         &self.recordings
+    }
+
+    /// All but those of the simulator's set.
+    pub fn without_simulator(&self) -> &[Recording] {
+        &self.recordings[..self.simulated]
     }
 
     /// Those of them that were driven along a path, not views that a model met.
@@ -152,7 +182,7 @@ impl Data {
 
     /// [`Recording::row_id`] of each training row, sorted.
     pub fn training_row_ids(&self) -> Vec<u64> {
-        let mut ids: Vec<u64> = self.split.training.iter().map(|item| self.row_id(item)).collect();
+        let mut ids: Vec<u64> = self.split.trained_on().map(|item| self.row_id(item)).collect();
         ids.sort_unstable();
         ids.dedup();
         ids
@@ -170,7 +200,9 @@ impl Data {
     pub fn rows_hash(&self) -> String {
         let mut hash = Sha256::new();
         hash.update(self.targets.geometry_text());
-        for side in [&self.split.training, &self.split.validation] {
+        let sides = [&self.split.training, &self.split.validation];
+        let simulator = Some(&self.split.simulator).filter(|rows| !rows.is_empty());
+        for side in sides.into_iter().chain(simulator) {
             hash.update((side.len() as u64).to_le_bytes());
             for item in side {
                 hash.update(self.row_id(item).to_le_bytes());
@@ -184,6 +216,7 @@ impl Data {
                 item.cameras().for_each(|camera| hash.update([camera as u8]));
             }
         }
+        self.split.times.iter().for_each(|times| hash.update(times.to_le_bytes()));
         hash.finalize().iter().take(16).map(|byte| format!("{byte:02x}")).collect()
     }
 
@@ -191,7 +224,7 @@ impl Data {
     /// the files of the others.
     pub fn pictures_hash(&self) -> String {
         let mut hash = Sha256::new();
-        for item in self.split.training.iter().chain(&self.split.validation) {
+        for item in self.split.training.iter().chain(&self.split.validation).chain(&self.split.simulator) {
             let recording = &self.recordings[usize::from(item.recording)];
             hash.update(recording.picture_hash(item.row as usize).unwrap_or_default().to_le_bytes());
             for camera in item.cameras().filter(|camera| *camera != View::Centre) {
@@ -224,7 +257,8 @@ impl Data {
         Ok(labels)
     }
 
-    /// Writes `split.csv`: recording, line of its log, side, cameras, steering.
+    /// Writes `split.csv`: recording, line of its log, side (`simulator` for rows of its set, which are trained on too), cameras,
+    /// steering.
     ///
     /// # Errors
     ///
@@ -233,7 +267,11 @@ impl Data {
         let failed = |e: csv::Error| Error::data(path, e.to_string());
         let mut writer = csv::Writer::from_writer(Vec::new());
         writer.write_record(["recording", "line", "side", "cameras", "steering"]).map_err(failed)?;
-        for (side, items) in [("training", &self.split.training), ("validation", &self.split.validation)] {
+        for (side, items) in [
+            ("training", &self.split.training),
+            ("simulator", &self.split.simulator),
+            ("validation", &self.split.validation),
+        ] {
             for item in items {
                 let recording = &self.recordings[usize::from(item.recording)];
                 let row = &recording.rows[item.row as usize];

@@ -14,7 +14,7 @@ pub struct EpochRecord {
     pub epoch: u32,
     /// Mean loss over the epoch's training batches, each before its update and with dropout.
     pub train_loss: f64,
-    /// Mean squared error over all validation images.
+    /// Mean squared error of the steering over all validation images.
     pub val_mse: Option<f64>,
     /// Mean squared error over the validation images of the centre camera.
     pub val_center_mse: Option<f64>,
@@ -26,6 +26,16 @@ pub struct EpochRecord {
     /// the recipe keeps by that.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub val_path_mse: Option<f64>,
+    /// Sum of the mean squared errors of all outputs over all validation images, each times its weight in the loss; of networks with
+    /// more outputs than the steering.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub val_weighted_mse: Option<f64>,
+    /// Mean absolute error of the throttle over the validation images of the centre camera, of networks that give one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub val_throttle_mae: Option<f64>,
+    /// The same of the speed, mph.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub val_speed_mae_mph: Option<f64>,
     /// Learning rate of the last update.
     pub learning_rate: f64,
     /// Number of training images.
@@ -80,6 +90,9 @@ mod tests {
             val_mae_deg: None,
             relative_to_zero: None,
             val_path_mse: None,
+            val_weighted_mse: None,
+            val_throttle_mae: None,
+            val_speed_mae_mph: None,
             learning_rate: 1e-3,
             images: 7,
             train_seconds: 1.5,

@@ -42,6 +42,9 @@ pub struct TrainRequest {
     pub validate: Vec<PathBuf>,
     /// Views that a model met, recordings too, which are always trained on.
     pub also: Vec<PathBuf>,
+    /// The simulator's set, of which each epoch draws the share that the recipe says; see
+    /// [`simulator_share`](crate::dataset::SampleSpec::simulator_share).
+    pub simulator: Vec<PathBuf>,
     /// What the user says about the recordings.
     pub said: Description,
     /// The experiment.
@@ -107,8 +110,17 @@ pub struct TrainResult {
     pub val_mae_deg: Option<f64>,
     /// Of the best epoch: `val_center_mse` ÷ mean squared label.
     pub relative_to_zero: Option<f64>,
+    /// Of the best epoch: mean absolute error of the throttle over the centre camera's images, of networks that give one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub val_throttle_mae: Option<f64>,
+    /// The same of the speed, mph.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub val_speed_mae_mph: Option<f64>,
     /// Training images an epoch.
     pub train_images: usize,
+    /// Those of them that are the simulator's.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub simulator_images: usize,
     /// Validation images.
     pub val_images: usize,
     /// Wall time of the run, interruptions left out.
@@ -133,6 +145,10 @@ pub struct TrainResult {
     pub profile: Option<ProfileReport>,
 }
 
+fn is_zero(number: &usize) -> bool {
+    *number == 0
+}
+
 /// Trains anew. Call it inside a rayon pool; `stop` and errors of `observer` end it after the current batch.
 ///
 /// # Errors
@@ -145,12 +161,24 @@ pub fn train(
     stop: &StopSignal,
 ) -> Result<TrainResult> {
     let started = Instant::now();
-    let TrainRequest { recordings, validate, also, said, recipe, out, seed, cache_mib, from, algorithm, profile } =
-        request;
+    let TrainRequest {
+        recordings,
+        validate,
+        also,
+        simulator,
+        said,
+        recipe,
+        out,
+        seed,
+        cache_mib,
+        from,
+        algorithm,
+        profile,
+    } = request;
     let profile = profile.then(Profile::start);
     let algorithm = algorithm.unwrap_or_else(ConvAlgorithm::of_environment);
     let start = from.as_ref().map(|from| Start::load(&from.model, from, &recipe, seed)).transpose()?;
-    let sources = Sources { paths: &recordings, validate: &validate, also: &also };
+    let sources = Sources { paths: &recordings, validate: &validate, also: &also, simulator: &simulator };
     let data = Data::prepare(sources, &said, &recipe, seed, cache_mib)?;
     let mut trained_on_held_out = held_out_tracks(&recordings)?;
     for track in start.iter().flat_map(|start| &start.trained_on_held_out) {
@@ -169,6 +197,7 @@ pub fn train(
         recordings: recordings.iter().map(absolute).collect::<Result<_>>()?,
         validate: validate.iter().map(absolute).collect::<Result<_>>()?,
         also: also.iter().map(absolute).collect::<Result<_>>()?,
+        simulator: simulator.iter().map(absolute).collect::<Result<_>>()?,
         cache_mib,
         said,
         rows_hash: data.rows_hash(),
@@ -254,6 +283,11 @@ pub fn resume_with(
         info.recordings.iter().chain(&info.validate).chain(&info.also).find(|path| moved.is_none() && !path.exists())
     {
         let message = "the recording is not there any more; if it was moved, say where it is with --recordings";
+        return Err(Error::data(gone, message));
+    }
+    if let Some(gone) = info.simulator.iter().find(|path| !path.exists()) {
+        let message = "this recording of the simulator's set is not there any more, and the run can only go on with it; any \
+                       `train RECORDING --with-simulator` in the same folder records it again";
         return Err(Error::data(gone, message));
     }
     let data = Data::of_run(&info, &recipe, info.cache_mib)?;
@@ -345,12 +379,15 @@ impl TrainingRun {
             Some(_) => recipe.batch.min(2 * most).max(capacity).next_multiple_of(PAIRS_CAPACITY),
             None => capacity,
         };
+        let plan = TrainingPlan::new(&network, plan_capacity);
         Ok(TrainingRun {
-            plan: TrainingPlan::new(&network, plan_capacity),
+            plan: match recipe.outputs.loss_weights() {
+                None => plan,
+                Some(weights) => plan.with_output_weights(&weights),
+            },
             smoothness,
-            validation: validation.map(|loader| {
-                Validation::new(loader, &network, capacity, recipe.full_lock_deg).with_path_labels(path_labels)
-            }),
+            validation: validation
+                .map(|loader| Validation::new(loader, &network, capacity, &recipe).with_path_labels(path_labels)),
             state: State {
                 average: recipe.averaging.map(|spec| WeightAverage::new(spec, &parameters, network.isa())),
                 parameters,
@@ -425,7 +462,7 @@ impl TrainingRun {
                 Some(validation) => validation.run(&self.network, self.state.model())?,
                 None => None,
             };
-            if validation.is_some_and(|v| !v.mse.is_finite()) {
+            if validation.is_some_and(|v| !(v.mse.is_finite() && v.weighted_mse.is_finite())) {
                 return Err(self.diverged("the validation loss is not finite"));
             }
             let record = self.end_epoch(validation, epoch_started);
@@ -547,6 +584,9 @@ impl TrainingRun {
             val_mae_deg: validation.map(|v| v.mae_deg),
             relative_to_zero: validation.and_then(|v| v.relative_to_zero),
             val_path_mse: validation.and_then(|v| v.path_mse),
+            val_weighted_mse: validation.map(|v| v.weighted_mse).filter(|_| self.recipe.outputs.count() > 1),
+            val_throttle_mae: validation.and_then(|v| v.throttle_mae),
+            val_speed_mae_mph: validation.and_then(|v| v.speed_mae_mph),
             learning_rate: progress.learning_rate,
             images: progress.images,
             train_seconds: progress.train_seconds,
@@ -558,7 +598,7 @@ impl TrainingRun {
 
         // Without a validation side, or with `keep = "last"`, the latest weights count as the best.
         let measure = match self.recipe.keep_by {
-            KeepBy::Loss => record.val_mse,
+            KeepBy::Loss => record.val_weighted_mse.or(record.val_mse),
             KeepBy::Path => record.val_path_mse,
         };
         let better = match (measure, progress.best_val_mse) {
@@ -573,7 +613,7 @@ impl TrainingRun {
             self.state.best = Some(best);
         }
         let progress = &mut self.state.progress;
-        if let Some(now) = record.val_mse {
+        if let Some(now) = record.val_weighted_mse.or(record.val_mse) {
             self.recipe.schedule.end_epoch(now, &mut progress.plateau);
         }
         if let Some(now) = measure {
@@ -617,7 +657,7 @@ impl TrainingRun {
     fn copy_into(&self, folder: &RunFolder, epoch: u32) -> Result<()> {
         folder.write_recipe(&self.recipe)?;
         folder.write_json("run.json", &self.info)?;
-        for name in ["from.safetensors", "split.csv", RunFolder::JOB_NOTE] {
+        for name in ["from.safetensors", "split.csv", RunFolder::JOB_NOTE, RunFolder::DAGGER_NOTE] {
             if self.folder.file(name).is_file() {
                 std::fs::copy(self.folder.file(name), folder.file(name)).map_err(Error::io(folder.file(name)))?;
             }
@@ -651,7 +691,7 @@ impl TrainingRun {
                 version: env!("CARGO_PKG_VERSION").into(),
                 isa: self.network.isa().name().into(),
                 seed: self.info.seed,
-                recordings: self.info.recordings.iter().map(|path| path.display().to_string()).collect(),
+                recordings: self.info.trained_on(),
                 epochs: epoch,
                 train_loss: record.train_loss,
                 val_mse: record.val_mse,
@@ -704,7 +744,10 @@ impl TrainingRun {
             val_center_mse: best.val_center_mse,
             val_mae_deg: best.val_mae_deg,
             relative_to_zero: best.relative_to_zero,
+            val_throttle_mae: best.val_throttle_mae,
+            val_speed_mae_mph: best.val_speed_mae_mph,
             train_images: self.training.samples_used(),
+            simulator_images: self.training.simulator_samples(),
             val_images: self.validation.as_ref().map_or(0, Validation::images),
             seconds: progress.seconds,
             images_per_second: images as f64 / seconds,

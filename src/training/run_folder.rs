@@ -49,6 +49,9 @@ pub(crate) struct RunInfo {
     /// Absolute paths of views that a model met, which are always trained on.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub also: Vec<PathBuf>,
+    /// Absolute paths of the simulator's set, of which each epoch draws some.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub simulator: Vec<PathBuf>,
     /// Memory for decoded images, in MiB.
     pub cache_mib: usize,
     /// What the user said about the recordings.
@@ -68,6 +71,14 @@ pub(crate) struct RunInfo {
 }
 
 impl RunInfo {
+    /// What was trained on, in words: the paths of the recordings, and of the folder of the simulator's set.
+    pub fn trained_on(&self) -> Vec<String> {
+        let recordings = self.recordings.iter().map(|path| path.display().to_string());
+        let set = self.simulator.first().and_then(|path| path.parent());
+        let set = set.map(|path| format!("the simulator's set in {}", path.display()));
+        recordings.chain(set).collect()
+    }
+
     /// How the convolutions of the run in `folder` are computed.
     ///
     /// # Errors
@@ -83,6 +94,8 @@ impl RunInfo {
 impl RunFolder {
     /// Name of the file in which the main job notes what follows on the training. It may be there before a run begins.
     pub const JOB_NOTE: &str = "main-job.json";
+    /// Name of the file that says which rounds of DAgger on the recording follow. It may be there before a run begins, too.
+    pub const DAGGER_NOTE: &str = "dagger.json";
     /// Name of the file that says what the model is worth on its recordings.
     pub const REPLAY: &str = "replay.json";
 
@@ -92,7 +105,7 @@ impl RunFolder {
     ///
     /// [`Error::Usage`] if there is something in it already, [`Error::Io`] if it cannot be read.
     pub fn require_free(path: &Path) -> Result<()> {
-        let may_be_there = [Self::JOB_NOTE, LOCK_NAME, checksums::FILE_NAME];
+        let may_be_there = [Self::JOB_NOTE, Self::DAGGER_NOTE, LOCK_NAME, checksums::FILE_NAME];
         let taken = |entry: std::io::Result<std::fs::DirEntry>| {
             entry
                 .is_ok_and(|e| !may_be_there.iter().any(|name| e.file_name() == *name) && !unfinished::is_left_over(&e))

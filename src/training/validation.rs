@@ -3,18 +3,26 @@
 use ndarray::ArrayViewMut1;
 
 use super::data;
-use crate::dataset::View;
 use crate::dataset::leak::NearTwins;
 use crate::dataset::loader::{Batch, Loader, LoaderTimes};
+use crate::dataset::{OutputKind, Outputs, View};
 use crate::engine::network::{InferencePlan, Network, Parameters};
 use crate::engine::stopwatch::Stopwatch;
 use crate::error::Result;
+use crate::recipe::Recipe;
 
 /// Errors of the network on the validation side.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct ValidationResult {
-    /// Mean squared error over all validation images.
+    /// Mean squared error of the steering over all validation images.
     pub mse: f64,
+    /// Sum of the mean squared errors of all outputs over all images, each times its weight in the loss: `mse` where there is but the
+    /// steering.
+    pub weighted_mse: f64,
+    /// Mean absolute error of the throttle over the centre camera's images, of networks that give one.
+    pub throttle_mae: Option<f64>,
+    /// The same of the speed, mph.
+    pub speed_mae_mph: Option<f64>,
     /// Mean squared error over the images of the centre camera, not mirrored; the fields below are of the same images.
     pub center_mse: f64,
     /// Mean absolute error in degrees of the front wheels.
@@ -33,19 +41,21 @@ pub(super) struct Validation {
     batches: [Batch; 2],
     predictions: Vec<f32>,
     full_lock_deg: f64,
+    outputs: Outputs,
     /// For each row of each recording, as far as asked for.
     path_labels: Vec<Vec<Option<f32>>>,
 }
 
 impl Validation {
-    /// Validates on the images of `loader`, whose batches have at most `capacity`.
-    pub fn new(loader: Loader, network: &Network, capacity: usize, full_lock_deg: f64) -> Validation {
+    /// Validates the network of `recipe` on the images of `loader`, whose batches have at most `capacity`.
+    pub fn new(loader: Loader, network: &Network, capacity: usize, recipe: &Recipe) -> Validation {
         Validation {
             plan: InferencePlan::new(network, capacity),
             batches: [Batch::default(), Batch::default()],
-            predictions: vec![0.0; capacity],
+            predictions: vec![0.0; capacity * network.output().len()],
             loader,
-            full_lock_deg,
+            full_lock_deg: recipe.full_lock_deg,
+            outputs: recipe.outputs.clone(),
             path_labels: Vec::new(),
         }
     }
@@ -82,14 +92,19 @@ impl Validation {
     ///
     /// [`Error::Io`](crate::Error::Io) if the image cache fails.
     pub fn run(&mut self, network: &Network, parameters: &Parameters) -> Result<Option<ValidationResult>> {
-        let Validation { loader, plan, batches: [current, next], predictions, full_lock_deg, path_labels } = self;
+        let Validation { loader, plan, batches: [current, next], predictions, full_lock_deg, outputs, path_labels } =
+            self;
+        let count = outputs.count();
+        // Of the outputs beside the steering.
+        let mut squares_beside = vec![0.0; count - 1];
+        let mut absolute_beside = vec![0.0; count - 1];
         let (mut squares, mut images) = (0.0, 0usize);
         let (mut center_squares, mut center_absolute, mut label_squares, mut center_images) = (0.0, 0.0, 0.0, 0usize);
         let (mut path_squares, mut path_images) = (0.0, 0usize);
         loader.fill(0, current)?;
         for batch in 0..loader.batches() {
             // The next batch is loaded while the network evaluates this one.
-            let predictions = &mut predictions[..current.n];
+            let predictions = &mut predictions[..current.n * count];
             let ((), filled) = rayon::join(
                 || {
                     plan.run(
@@ -102,11 +117,19 @@ impl Validation {
                 || if batch + 1 < loader.batches() { loader.fill(batch + 1, next) } else { Ok(()) },
             );
             filled?;
-            for ((sample, label), prediction) in current.samples.iter().zip(&current.labels).zip(predictions) {
+            let answers = current.labels.chunks_exact(count).zip(predictions.chunks_exact(count));
+            for (sample, (labels, predictions)) in current.samples.iter().zip(answers) {
+                let is_plain = sample.camera == View::Centre && !sample.mirrored;
+                for beside in 1..count {
+                    let error = f64::from(predictions[beside]) - f64::from(labels[beside]);
+                    squares_beside[beside - 1] += error * error;
+                    absolute_beside[beside - 1] += if is_plain { error.abs() } else { 0.0 };
+                }
+                let (label, prediction) = (&labels[0], &predictions[0]);
                 let (label, error) = (f64::from(*label), f64::from(*prediction) - f64::from(*label));
                 squares += error * error;
                 images += 1;
-                if sample.camera == View::Centre && !sample.mirrored {
+                if is_plain {
                     center_squares += error * error;
                     center_absolute += error.abs();
                     label_squares += label * label;
@@ -124,8 +147,14 @@ impl Validation {
             return Ok(None);
         }
         let center = center_images.max(1) as f64;
+        let weighted = outputs.specs()[1..].iter().zip(&squares_beside);
+        let beside: f64 = weighted.map(|(output, squares)| output.loss_weight * squares / images as f64).sum();
+        let mae = |kind| outputs.index(kind).map(|index| absolute_beside[index - 1] / center);
         Ok(Some(ValidationResult {
             mse: squares / images as f64,
+            weighted_mse: outputs.specs()[0].loss_weight * (squares / images as f64) + beside,
+            throttle_mae: mae(OutputKind::Throttle),
+            speed_mae_mph: mae(OutputKind::Speed).zip(outputs.top_speed_mph()).map(|(mae, top_mph)| mae * top_mph),
             center_mse: center_squares / center,
             mae_deg: center_absolute / center * *full_lock_deg,
             relative_to_zero: (label_squares > 0.0).then(|| center_squares / label_squares),

@@ -25,8 +25,8 @@ import onnx
 import onnxruntime
 from PIL import Image
 
-# Largest difference of the steering: from the preprocessed picture on; from the camera image on, on 99 % of the rows and on
-# all. Steering beyond 1, as untrained models give, is compared in relative terms.
+# Largest difference of the outputs: from the preprocessed picture on; from the camera image on, on 99 % of the rows and on
+# all. Outputs beyond 1, as untrained models give, are compared in relative terms.
 NETWORK_BOUND = 1e-5
 IMAGE_BOUND_99 = 1e-5
 IMAGE_BOUND_ALL = 2e-3
@@ -69,11 +69,11 @@ class Pictures:
         return self.sizes[height, width]
 
 
-def predictions(steersman, model, files):
+def predictions(steersman, model, files, names):
     answers = []
     for start in range(0, len(files), IMAGES_A_CALL):
         text = run(steersman, "predict", model, *files[start : start + IMAGES_A_CALL], "--json")
-        answers += [answer["steering"] for answer in json.loads(text.splitlines()[-1])]
+        answers += [[answer[name] for name in names] for answer in json.loads(text.splitlines()[-1])]
     return np.array(answers, np.float64)
 
 
@@ -104,24 +104,25 @@ def check(steersman, model, pictures, folder):
     assert not missing, f"{model}: no metadata {missing}"
     _, height, width, _ = (axis.dim_value for axis in proto.graph.input[0].type.tensor_type.shape.dim)
     files, pixels = pictures.of_size(height, width)
-    expected = predictions(steersman, model, files)
+    names = [output.name for output in proto.graph.output]
+    expected = predictions(steersman, model, files, names)
     scale = np.maximum(1.0, np.abs(expected))
 
     # The same graph, which also shows the preprocessed picture.
     shape = onnx.load_from_string(export(steersman, model, folder).SerializeToString()).graph.input[0]
     proto.graph.output.append(shape)
-    steering, tensors = in_batches(session(proto), ["steering", "input"], pixels, 7)
-    forms = [("image", steering, True)]
+    *outputs, tensors = in_batches(session(proto), [*names, "input"], pixels, 7)
+    forms = [("image", outputs, True)]
     folded = export(steersman, model, folder, "--with-preprocessing", "--fold-batch-norm")
-    forms.append(("image, folded", in_batches(session(folded), ["steering"], pixels, 1)[0], True))
+    forms.append(("image, folded", in_batches(session(folded), names, pixels, 1), True))
     for name, flags in [("tensor", []), ("tensor, folded", ["--fold-batch-norm"])]:
         plain = export(steersman, model, folder, *flags)
-        forms.append((name, in_batches(session(plain), ["steering"], tensors, 64)[0], False))
+        forms.append((name, in_batches(session(plain), names, tensors, 64), False))
 
     holds = True
-    for name, steering, from_image in forms:
-        assert steering.shape == (len(files), 1), steering.shape
-        error = np.abs(steering[:, 0] - expected) / scale
+    for name, outputs, from_image in forms:
+        assert all(output.shape == (len(files), 1) for output in outputs), [output.shape for output in outputs]
+        error = (np.abs(np.hstack(outputs) - expected) / scale).max(axis=1)
         if from_image:
             good = np.quantile(error, 0.99) <= IMAGE_BOUND_99 and error.max() <= IMAGE_BOUND_ALL
         else:

@@ -1,6 +1,6 @@
 """Small Keras files of every kind, with the outputs that Keras gives: `keras/*` and `keras/expected.json`. See README.md.
 
-`keras3` and `functional` are written by Keras itself, in both of its formats. The styles of Keras 1 and 2 are written with h5py in
+`keras3`, `functional` and `donkey` are written by Keras itself, in both of its formats. The styles of Keras 1 and 2 are written with h5py in
 the layout, the names and the spelling that those versions used, from the weights of the model `plain`, and must give its outputs.
 """
 
@@ -117,6 +117,20 @@ def plain():
         layers.Dense(6, activation="relu", name="dense"),
         layers.Dense(1, name="steering"),
     ], name="plain")
+
+
+def donkey():
+    """As donkeycar's linear network: two outputs of one trunk."""
+    image = keras.Input((22, 30, 3), name="img_in")
+    x = layers.Rescaling(1 / 255.0)(image)
+    x = layers.Conv2D(4, 5, strides=2, activation="relu", name="conv2d_1")(x)
+    x = layers.Dropout(0.2)(x)
+    x = layers.Conv2D(5, 3, activation="relu", name="conv2d_2")(x)
+    x = layers.Flatten(name="flattened")(x)
+    x = layers.Dense(7, activation="relu", name="dense_1")(x)
+    x = layers.Dropout(0.2)(x)
+    outputs = [layers.Dense(1, activation="linear", name=f"n_outputs{i}")(x) for i in range(2)]
+    return keras.Model(image, outputs, name="linear")
 
 
 def lambda_code(base64):
@@ -288,11 +302,12 @@ def hostile():
 def main():
     OUT.mkdir(exist_ok=True)
     expected = {"keras": keras.__version__, "images": IMAGES}
-    for seed, build in enumerate([keras3, functional, plain]):
+    for seed, build in enumerate([keras3, functional, plain, donkey]):
         model = build()
         randomise(model, seed)
         shape = model.input_shape[1:]
-        y = model.predict(inputs(shape), verbose=0)[:, 0]
+        y = model.predict(inputs(shape), verbose=0)
+        y = np.concatenate(y if isinstance(y, list) else [y], axis=1).ravel()
         expected[build.__name__] = {"input": [int(n) for n in shape], "outputs": [float(v) for v in y]}
         if build is plain:
             hand_made(model)

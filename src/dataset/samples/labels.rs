@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::augment::Augmentation;
+use super::outputs::Outputs;
 use super::spec::{Correction, Item, Mirror, SampleSpec};
 use crate::dataset::driven::DrivenSessions;
 use crate::dataset::recording::{Recording, View};
@@ -77,6 +78,10 @@ impl LabelSpec {
 pub struct Targets {
     recordings: Vec<OfRecording>,
     notices: Vec<String>,
+    /// Number of outputs beside the steering.
+    beside_steering: usize,
+    /// Whether rows have no label because their recording lacks one beside the steering.
+    unrecorded: bool,
 }
 
 #[derive(Debug)]
@@ -85,6 +90,15 @@ struct OfRecording {
     labels: Vec<f32>,
     /// Camera and car, and what each row aims at; only where something asks for geometry.
     geometry: Option<(CarGeometry, Vec<Aim>)>,
+    /// Labels beside the steering, `[rows][outputs − 1]`.
+    beside_steering: Vec<f32>,
+}
+
+impl OfRecording {
+    /// With the steering alone.
+    fn of(labels: Vec<f32>, geometry: Option<(CarGeometry, Vec<Aim>)>) -> OfRecording {
+        OfRecording { labels, geometry, beside_steering: Vec::new() }
+    }
 }
 
 /// The point that a driver aims at, seen from where the car is.
@@ -118,18 +132,28 @@ impl Targets {
             || samples.mirror == Mirror::Geometry
             || augmentation.view.is_some()
             || augmentation.shift_steering_per_px == Some(Correction::Geometry);
-        let mut targets = Targets { recordings: Vec::new(), notices: Vec::new() };
-        for recording in recordings {
-            if geometry {
-                targets.add_driven(recording, spec);
-            } else {
-                targets.recordings.push(OfRecording { labels: steering(recording), geometry: None });
-            }
-            if let Some(of) = targets.recordings.last_mut().filter(|_| spec.shift_s > 0.0) {
-                of.labels = later(recording, &of.labels, spec.shift_s);
-            }
-        }
+        let mut targets =
+            Targets { recordings: Vec::new(), notices: Vec::new(), beside_steering: 0, unrecorded: false };
+        recordings.iter().for_each(|recording| targets.add(recording, spec, geometry));
         targets
+    }
+
+    /// The same with `more` behind them, drives whose labels are made as those of the first.
+    pub fn with_drives(mut self, more: &[Recording], spec: &LabelSpec) -> Targets {
+        let geometry = self.recordings.iter().any(|recording| recording.geometry.is_some());
+        more.iter().for_each(|recording| self.add(recording, spec, geometry));
+        self
+    }
+
+    fn add(&mut self, recording: &Recording, spec: &LabelSpec, geometry: bool) {
+        if geometry {
+            self.add_driven(recording, spec);
+        } else {
+            self.recordings.push(OfRecording::of(steering(recording), None));
+        }
+        if let Some(of) = self.recordings.last_mut().filter(|_| spec.shift_s > 0.0) {
+            of.labels = later(recording, &of.labels, spec.shift_s);
+        }
     }
 
     /// The same with `views` behind them, single pictures each with the steering that leads back to a path: that is the label, whatever
@@ -148,9 +172,57 @@ impl Targets {
                 Aim { right_m: to.right_m as f32, ahead_m: to.ahead_m as f32, look_ahead_m: look_ahead_m as f32 }
             });
             let geometry = geometry.then(|| (car.clone(), aims.collect()));
-            self.recordings.push(OfRecording { labels: steering(recording), geometry });
+            self.recordings.push(OfRecording::of(steering(recording), geometry));
         }
         self
+    }
+
+    /// The same with the labels of all `outputs` for `recordings`, those that it was made of. What moves the steering leaves the others
+    /// as they are: they belong to the row, from wherever it is seen and whether it is mirrored or not. A row that lacks one of them
+    /// has no label at all. `spec` says how much later all labels are.
+    ///
+    /// # Errors
+    /// [`Error::Data`] with place and remedy for recordings without what an output learns from.
+    pub fn with_outputs<'a>(
+        mut self,
+        recordings: impl IntoIterator<Item = &'a Recording>,
+        outputs: &Outputs,
+        spec: &LabelSpec,
+    ) -> Result<Targets> {
+        self.beside_steering = outputs.count() - 1;
+        if self.beside_steering == 0 {
+            return Ok(self);
+        }
+        for (of, recording) in self.recordings.iter_mut().zip(recordings) {
+            of.beside_steering = outputs.labels_beside_steering(recording, spec.shift_s, &mut self.notices)?;
+            for (label, others) in of.labels.iter_mut().zip(of.beside_steering.chunks_exact(self.beside_steering)) {
+                if !label.is_nan() && others.iter().any(|other| other.is_nan()) {
+                    *label = f32::NAN;
+                    self.unrecorded = true;
+                }
+            }
+        }
+        Ok(self)
+    }
+
+    /// Number of labels of a row.
+    pub fn outputs(&self) -> usize {
+        1 + self.beside_steering
+    }
+
+    /// Whether rows have no label because their recording lacks one beside the steering.
+    pub fn unrecorded(&self) -> bool {
+        self.unrecorded
+    }
+
+    /// The labels of a row beside its steering, in the order of the outputs.
+    ///
+    /// # Panics
+    /// If there is no such row.
+    pub fn labels_beside_steering(&self, item: Item) -> &[f32] {
+        let of = &self.recordings[usize::from(item.recording)].beside_steering;
+        let row = item.row as usize * self.beside_steering;
+        if self.beside_steering == 0 { &[] } else { &of[row..row + self.beside_steering] }
     }
 
     /// The recorded steering of `recordings`, for samples that need no geometry.
@@ -190,7 +262,7 @@ impl Targets {
         if let Some(mps) = driven.assumed_speed_mps {
             self.notices.push(format!("{}: no speed was recorded; {mps:.1} m/s is assumed", recording.path.display()));
         }
-        self.recordings.push(OfRecording { labels, geometry: Some((car.clone(), aims)) });
+        self.recordings.push(OfRecording::of(labels, Some((car.clone(), aims))));
     }
 
     /// What the user should know: camera presets and speeds that were assumed.
@@ -246,6 +318,7 @@ impl Targets {
             let Aim { right_m, ahead_m, look_ahead_m } = aims[item.row as usize];
             [right_m, ahead_m, look_ahead_m].into_iter().for_each(|m| hash(m.to_bits()));
         }
+        self.labels_beside_steering(item).iter().for_each(|label| hash(label.to_bits()));
     }
 
     /// The geometry of all recordings in words, for a hash; nothing where none is asked for.
@@ -268,7 +341,7 @@ pub(super) fn chained(first: Offset, then: Offset) -> Offset {
 }
 
 /// The labels `shift_s` later in the session of each row, between rows by linear interpolation; NaN beyond its end.
-fn later(recording: &Recording, labels: &[f32], shift_s: f64) -> Vec<f32> {
+pub(super) fn later(recording: &Recording, labels: &[f32], shift_s: f64) -> Vec<f32> {
     let mut shifted = vec![f32::NAN; labels.len()];
     for session in &recording.sessions {
         let time_ms = |row: usize| recording.rows[row].time_ms as f64;

@@ -58,7 +58,8 @@ pub struct SampleId {
 pub struct Batch {
     /// Network input, `[n][c][h][w]`.
     pub x: Vec<f32>,
-    /// Labels, `[n]`: steering with the corrections of camera and shift, + = right, not clamped.
+    /// Labels, `[n][outputs]`: steering with the corrections of camera and shift, + = right, not clamped; then the others of the row,
+    /// as they are.
     pub labels: Vec<f32>,
     /// Number of samples; less than asked for at the end of an epoch, and where images cannot be decoded.
     pub n: usize,
@@ -79,20 +80,46 @@ pub struct Loader {
     /// Only the training side shuffles, mirrors at random and augments.
     training: bool,
     flip: Flip,
+    /// The rows of the side, as often as each counts; then those of the simulator.
     items: Vec<Item>,
     /// Each image: its item and camera. Images of an item stand together.
     images: Vec<(u32, View)>,
+    /// The picture of each image: images of the same row and camera have the same one.
+    pictures: Vec<u32>,
     /// First image of each item, and their number at the end.
     first_images: Vec<u32>,
+    /// What is the side's own.
+    own: Counts,
+    /// Samples or items of the simulator that are drawn in each epoch, among all of them.
+    drawn: usize,
+    pool: Vec<u32>,
     /// What is taken in this order: samples, or items with [`Group::Rows`].
     order: Vec<u32>,
     pairing: Option<Pairing>,
     epoch: u64,
     cache: ImageCache,
-    thumbnails: Vec<OnceLock<Thumbnail>>,
+    /// Of each picture that was decoded: what the audit compares, if it is the centre camera's.
+    thumbnails: Vec<OnceLock<Option<Thumbnail>>>,
     undecodable: Mutex<BTreeMap<u32, String>>,
     scratch: Mutex<Vec<Scratch>>,
     times: LoaderTimes,
+}
+
+/// A part of a side.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Counts {
+    items: usize,
+    images: usize,
+    pictures: usize,
+}
+
+/// The rows that a loader shows.
+#[derive(Clone, Copy)]
+struct Rows<'a> {
+    own: &'a [Item],
+    /// How often each of them counts; once if there is nothing.
+    times: &'a [u32],
+    simulator: &'a [Item],
 }
 
 /// Where the time of making samples goes, summed over threads; nothing is measured by default.
@@ -133,7 +160,7 @@ impl Loader {
             images * cached_len(spec, training, flip)
         };
         let (training, validation) = (
-            bytes(true, spec.samples.flip, &split.training),
+            bytes(true, spec.samples.flip, &split.training) + bytes(true, spec.samples.flip, &split.simulator),
             bytes(false, validation_flip(&spec.samples), &split.validation),
         );
         let share = training as f64 / (training + validation).max(1) as f64;
@@ -146,7 +173,8 @@ impl Loader {
         ))
     }
 
-    /// The training side: shuffled in every epoch, mirrored and augmented as `spec` says.
+    /// The training side: shuffled in every epoch, mirrored and augmented as `spec` says. Of the simulator's rows each epoch shows so
+    /// many that they are the share of it that `spec` says, or all of them.
     ///
     /// # Errors
     /// As [`Loader::pair`].
@@ -156,7 +184,8 @@ impl Loader {
         split: &Split,
         spec: &LoaderSpec,
     ) -> Result<Loader> {
-        Self::new(recordings, targets, &split.training, spec, true, spec.samples.flip)
+        let rows = Rows { own: &split.training, times: &split.times, simulator: &split.simulator };
+        Self::new(recordings, targets, rows, spec, true, spec.samples.flip)
     }
 
     /// The validation side: in the order of the log, never augmented.
@@ -169,13 +198,14 @@ impl Loader {
         split: &Split,
         spec: &LoaderSpec,
     ) -> Result<Loader> {
-        Self::new(recordings, targets, &split.validation, spec, false, validation_flip(&spec.samples))
+        let rows = Rows { own: &split.validation, times: &[], simulator: &[] };
+        Self::new(recordings, targets, rows, spec, false, validation_flip(&spec.samples))
     }
 
     fn new(
         recordings: &Arc<[Recording]>,
         targets: &Arc<Targets>,
-        items: &[Item],
+        rows: Rows,
         spec: &LoaderSpec,
         training: bool,
         flip: Flip,
@@ -186,22 +216,38 @@ impl Loader {
         if spec.batch == 0 {
             return Err(Error::Usage("a batch must hold at least one image".into()));
         }
-        let mut images = Vec::new();
-        let mut first_images = vec![0];
-        for (i, item) in items.iter().enumerate() {
-            images.extend(item.cameras().map(|camera| (i as u32, camera)));
-            first_images.push(images.len() as u32);
+        let (mut items, mut images, mut pictures, mut first_images) = (Vec::new(), Vec::new(), Vec::new(), vec![0]);
+        let mut known = 0;
+        let mut add = |item: Item, times: u32| {
+            for _ in 0..times {
+                let number = items.len() as u32;
+                images.extend(item.cameras().map(|camera| (number, camera)));
+                pictures.extend((known..).take(item.cameras().count()));
+                first_images.push(images.len() as u32);
+                items.push(item);
+            }
+            known += item.cameras().count() as u32;
+            Counts { items: items.len(), images: images.len(), pictures: known as usize }
+        };
+        let mut own = Counts { items: 0, images: 0, pictures: 0 };
+        for (i, item) in rows.own.iter().enumerate() {
+            own = add(*item, rows.times.get(i).copied().unwrap_or(1));
         }
+        let all = rows.simulator.iter().fold(own, |_, item| add(*item, 1));
         let mut loader = Loader {
             recordings: Arc::clone(recordings),
             targets: Arc::clone(targets),
             training,
             flip,
-            cache: ImageCache::new(images.len(), cached_len(spec, training, flip), &spec.cache)?,
-            thumbnails: items.iter().map(|_| OnceLock::new()).collect(),
-            items: items.to_vec(),
+            cache: ImageCache::new(all.pictures, cached_len(spec, training, flip), &spec.cache)?,
+            thumbnails: (0..all.pictures).map(|_| OnceLock::new()).collect(),
+            items,
             images,
+            pictures,
             first_images,
+            own,
+            drawn: 0,
+            pool: Vec::new(),
             order: Vec::new(),
             pairing: None,
             epoch: 0,
@@ -210,6 +256,9 @@ impl Loader {
             times: LoaderTimes::default(),
             spec: spec.clone(),
         };
+        let ratio = spec.samples.simulator_share / (1.0 - spec.samples.simulator_share);
+        let own = loader.entries(loader.own);
+        loader.drawn = ((ratio * own as f64).round() as usize).min(loader.entries(all) - own);
         loader.begin_epoch(0);
         Ok(loader)
     }
@@ -229,14 +278,39 @@ impl Loader {
         self.times = times.clone();
     }
 
-    /// Number of images, mirrors not counted.
+    /// Number of different images, mirrors not counted.
     pub fn images(&self) -> usize {
-        self.images.len()
+        self.thumbnails.len()
     }
 
-    /// Number of samples in an epoch: images, twice if each is also mirrored.
+    /// Number of samples in an epoch: images as often as they count, twice if each is also mirrored.
     pub fn samples(&self) -> usize {
-        self.images.len() * self.variants()
+        let own = self.own.images * self.variants();
+        match self.spec.samples.group {
+            Group::Images => own + self.drawn,
+            // Rows may have one camera or three.
+            Group::Rows => {
+                let of_simulator = (self.images.len() - self.own.images) * self.variants();
+                own + self.drawn * of_simulator / self.simulator_items().max(1)
+            }
+        }
+    }
+
+    /// Number of samples of the simulator in an epoch.
+    pub fn simulator_samples(&self) -> usize {
+        self.samples() - self.own.images * self.variants()
+    }
+
+    fn simulator_items(&self) -> usize {
+        self.items.len() - self.own.items
+    }
+
+    /// How many entries of `order` show `part`, each once.
+    fn entries(&self, part: Counts) -> usize {
+        match self.spec.samples.group {
+            Group::Images => part.images * self.variants(),
+            Group::Rows => part.items,
+        }
     }
 
     /// Number of batches in an epoch.
@@ -254,12 +328,17 @@ impl Loader {
     /// Sets the order of the samples and the random choices of `epoch`.
     pub fn begin_epoch(&mut self, epoch: u32) {
         self.epoch = u64::from(epoch);
-        let count = match self.spec.samples.group {
-            Group::Images => self.samples(),
-            Group::Rows => self.items.len(),
-        };
+        let own = self.entries(self.own);
         self.order.clear();
-        self.order.extend(0..count as u32);
+        self.order.extend(0..own as u32);
+        if self.drawn > 0 {
+            let all = Counts { items: self.items.len(), images: self.images.len(), pictures: self.thumbnails.len() };
+            self.pool.clear();
+            self.pool.extend(own as u32..self.entries(all) as u32);
+            // Stream 1: the order of the epoch is drawn from stream 0.
+            shuffle(&mut rng(self.spec.seed, Purpose::Shuffle, self.epoch, 1), &mut self.pool);
+            self.order.extend_from_slice(&self.pool[..self.drawn]);
+        }
         if self.training {
             shuffle(&mut rng(self.spec.seed, Purpose::Shuffle, self.epoch, 0), &mut self.order);
         }
@@ -292,11 +371,12 @@ impl Loader {
         let len = self.spec.preprocessing.output_len();
         out.n = out.work.len();
         out.x.resize(out.n * len, 0.0);
-        out.labels.resize(out.n, 0.0);
-        let samples = out.x.par_chunks_exact_mut(len).zip(&mut out.labels).zip(&mut out.work);
-        samples.try_for_each(|((x, label), wanted)| -> Result<()> {
-            let made = self.with_scratch(|scratch| self.make_sample(wanted, x, scratch))??;
-            (*label, wanted.decoded) = (made.unwrap_or(0.0), made.is_some());
+        let outputs = self.targets.outputs();
+        out.labels.resize(out.n * outputs, 0.0);
+        let labels = out.labels.par_chunks_exact_mut(outputs);
+        let samples = out.x.par_chunks_exact_mut(len).zip(labels).zip(&mut out.work);
+        samples.try_for_each(|((x, labels), wanted)| -> Result<()> {
+            wanted.decoded = self.with_scratch(|scratch| self.make_sample(wanted, x, labels, scratch))??;
             Ok(())
         })?;
         self.close_gaps(out);
@@ -309,20 +389,28 @@ impl Loader {
         (undecodable.len(), undecodable.values().take(3).cloned().collect())
     }
 
-    /// Whether more than a fifth of the images could not be decoded so far.
+    /// Whether more than a fifth of the images could not be decoded so far, of the side's own ones or of the simulator's.
     pub fn has_decayed(&self) -> bool {
-        lock(&self.undecodable).len() * 5 > self.images.len()
+        let undecodable = lock(&self.undecodable);
+        let own = undecodable.range(..self.own.pictures as u32).count();
+        let simulator = undecodable.len() - own;
+        own * 5 > self.own.pictures || simulator * 5 > self.thumbnails.len() - self.own.pictures
     }
 
     /// Number of samples in an epoch without the images that could not be decoded so far.
     pub fn samples_used(&self) -> usize {
-        (self.images.len() - lock(&self.undecodable).len()) * self.variants()
+        let undecodable = lock(&self.undecodable);
+        let lost = self.pictures[..self.own.images].iter().filter(|picture| undecodable.contains_key(picture)).count();
+        self.samples() - lost * self.variants()
     }
 
-    /// How many frames of this (validation) loader have a near twin in `training`. Frames are known once they were
-    /// decoded, so this is to be asked after the first epoch.
+    /// How many frames of this (validation) loader have a near twin in `training`. Frames are known once they, or those of the other
+    /// cameras beside them, were shown, so this is to be asked after the first epoch.
     pub fn near_twins(&self, training: &Loader) -> NearTwins {
-        let seen = |loader: &'_ Loader| loader.thumbnails.iter().filter_map(OnceLock::get).cloned().collect::<Vec<_>>();
+        training.look_at_centres();
+        let seen = |loader: &'_ Loader| {
+            loader.thumbnails.iter().filter_map(OnceLock::get).flatten().cloned().collect::<Vec<_>>()
+        };
         let (validation, training) = (seen(self), seen(training));
         NearTwins::count(&validation.iter().collect::<Vec<_>>(), &training.iter().collect::<Vec<_>>())
     }
@@ -357,7 +445,7 @@ impl Loader {
 
     /// Moves samples up to where others could not be decoded, and notes where the rest come from. A pair goes as a whole.
     fn close_gaps(&self, out: &mut Batch) {
-        let len = self.spec.preprocessing.output_len();
+        let (len, outputs) = (self.spec.preprocessing.output_len(), self.targets.outputs());
         let mut n = 0;
         out.samples.clear();
         let pairs = out.pairs;
@@ -371,7 +459,7 @@ impl Loader {
             }
             if n < i {
                 out.x.copy_within(i * len..(i + 1) * len, n * len);
-                out.labels[n] = out.labels[i];
+                out.labels.copy_within(i * outputs..(i + 1) * outputs, n * outputs);
             }
             let (item, camera) = self.images[sample as usize / self.variants()];
             let Item { recording, row, .. } = self.items[item as usize];
@@ -380,7 +468,7 @@ impl Loader {
         }
         out.n = n;
         out.x.truncate(n * len);
-        out.labels.truncate(n);
+        out.labels.truncate(n * outputs);
     }
 
     /// Runs `work` with buffers that no other thread uses.

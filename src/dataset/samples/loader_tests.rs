@@ -420,3 +420,98 @@ fn batches_hold_pairs_of_one_image_and_of_neighbours() {
     let (found, samples) = assert_pairs(&mut loader, &smoothness);
     assert!(samples < 900 && samples % 2 == 0 && found[0] + found[1] == samples / 2, "{found:?}, {samples}");
 }
+
+/// The second recording is the simulator's: all of its rows can be drawn.
+fn mixed(folder: &Path, simulator_rows: usize, simulator_share: f64) -> (Arc<[Recording]>, Split, LoaderSpec) {
+    let [own, simulator] = ["own", "simulator"].map(|name| folder.join(name));
+    drive(&own, 150);
+    drive(&simulator, simulator_rows);
+    let recordings: Arc<[Recording]> = Arc::from([load(&own).unwrap(), load(&simulator).unwrap()]);
+    let samples = SampleSpec { simulator_share, ..augmented().samples };
+    let spec = LoaderSpec { samples, ..augmented() };
+    let mut split = divide(&recordings[..1], &spec);
+    let targets = targets(&recordings, &spec);
+    split.draw_from(&recordings, 1, &targets, &spec.samples, &Balance::default(), 1).unwrap();
+    (recordings, split, spec)
+}
+
+#[test]
+fn an_epoch_shows_all_of_the_recording_and_the_simulators_share_drawn_anew() {
+    let folder = tempfile::tempdir().unwrap();
+    let (recordings, split, spec) = mixed(folder.path(), 260, 0.25);
+    let targets = targets(&recordings, &spec);
+    let mut loader = Loader::training(&recordings, &targets, &split, &spec).unwrap();
+    let own = split.training.len() * 6;
+    let drawn = (own as f64 / 3.0).round() as usize;
+    assert_eq!((loader.samples(), loader.simulator_samples()), (own + drawn, drawn));
+    assert_eq!(loader.images(), split.training.len() * 3 + 260 * 3);
+    let mut shown = |epoch: u32| -> [Vec<String>; 2] {
+        loader.begin_epoch(epoch);
+        let (mut batch, mut seen) = (Batch::default(), [Vec::new(), Vec::new()]);
+        for i in 0..loader.batches() {
+            loader.fill(i, &mut batch).unwrap();
+            batch.samples.iter().for_each(|id| seen[usize::from(id.recording)].push(format!("{id:?}")));
+        }
+        for side in &mut seen {
+            let all = side.len();
+            side.sort();
+            side.dedup();
+            assert_eq!(side.len(), all, "nothing is shown twice");
+        }
+        seen
+    };
+    let [first, second, again] = [shown(0), shown(1), shown(0)];
+    assert_eq!((first[0].len(), first[1].len()), (own, drawn));
+    assert!(first[0] == second[0] && first[1] != second[1] && second[1].len() == drawn && again == first);
+    assert_eq!(loader.samples_used(), own + drawn);
+
+    // A set that is smaller than its share is shown whole.
+    let other = tempfile::tempdir().unwrap();
+    let (recordings, split, spec) = mixed(other.path(), 40, 0.95);
+    let loader = Loader::training(&recordings, &targets, &split, &spec).unwrap();
+    assert_eq!(loader.simulator_samples(), 40 * 6);
+}
+
+#[test]
+fn rows_that_count_several_times_are_decoded_once_and_changed_each_time() {
+    let folder = tempfile::tempdir().unwrap();
+    let recordings = recordings(folder.path(), 150);
+    let spec = augmented();
+    let mut split = divide(&recordings, &spec);
+    split.times = split.training.iter().map(|item| if item.row == 0 { 3 } else { 1 }).collect();
+    fs::write(recordings[0].image_path(1, View::Centre).unwrap(), "no picture").unwrap();
+    let mut loader = Loader::training(&recordings, &targets(&recordings, &spec), &split, &spec).unwrap();
+    assert_eq!((loader.images(), loader.samples()), (split.training.len() * 3, (split.training.len() + 2) * 6));
+    let of_row = |shown: &[(Vec<u32>, Vec<u32>, Vec<SampleId>)], row: u32| -> Vec<Vec<u32>> {
+        let len = spec.preprocessing.output_len();
+        let samples = shown.iter().flat_map(|(x, _, ids)| x.chunks_exact(len).zip(ids));
+        let wanted = SampleId { recording: 0, row, camera: View::Centre, mirrored: false };
+        samples.filter(|(_, id)| **id == wanted).map(|(x, _)| x.to_vec()).collect()
+    };
+    let shown = epochs(&mut loader);
+    let mut pictures = of_row(&shown[..shown.len() / 2], 0);
+    assert_eq!(pictures.len(), 3);
+    pictures.sort();
+    pictures.dedup();
+    assert_eq!(pictures.len(), 3, "each time with changes of its own");
+    assert_eq!(of_row(&shown[..shown.len() / 2], 2).len(), 1);
+    // What cannot be decoded is counted once; its mirror goes too.
+    let lost = usize::from(split.training.iter().any(|item| item.row == 1));
+    assert_eq!((loader.undecodable().0, loader.samples_used()), (lost, loader.samples() - 2 * lost));
+}
+
+#[test]
+fn frames_are_audited_though_views_show_their_side_pictures_instead() {
+    let folder = tempfile::tempdir().unwrap();
+    let recordings = recordings(folder.path(), 150);
+    let mut spec = geometric();
+    spec.augmentation.view = Some(ViewSpec { offset_m: 2.0, turn_deg: 6.0, probability: 1.0 });
+    let split = divide(&recordings, &spec);
+    let mut loader = Loader::training(&recordings, &targets(&recordings, &spec), &split, &spec).unwrap();
+    let mut batch = Batch::default();
+    loader.begin_epoch(0);
+    (0..loader.batches()).for_each(|i| loader.fill(i, &mut batch).unwrap());
+    let decoded = loader.thumbnails.iter().filter_map(OnceLock::get).flatten().count();
+    assert!(decoded < split.training.len(), "some centre pictures were not needed");
+    assert_eq!(loader.near_twins(&loader).frames, split.training.len());
+}

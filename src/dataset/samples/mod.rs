@@ -5,6 +5,7 @@ mod balance;
 mod labels;
 pub mod leak;
 pub mod loader;
+mod outputs;
 mod pairs;
 mod spec;
 pub mod split;
@@ -13,4 +14,5 @@ pub mod whole;
 
 pub use balance::Balance;
 pub use labels::{LabelKind, LabelSpec, Targets};
+pub use outputs::{OutputKind, OutputSpec, Outputs};
 pub use spec::{Correction, Flip, Group, Item, Mirror, SampleSpec};

@@ -118,6 +118,10 @@ pub struct SampleSpec {
     /// the share of such rows that count once more.
     #[serde(skip_serializing_if = "is_one")]
     pub takeover_weight: f64,
+    /// Share of an epoch's samples that are the simulator's, where a run trains on its set as well; they are drawn anew in each
+    /// epoch. It says nothing of other runs.
+    #[serde(skip_serializing_if = "is_usual_share")]
+    pub simulator_share: f64,
 }
 
 impl Default for SampleSpec {
@@ -131,8 +135,16 @@ impl Default for SampleSpec {
             validation_side_cameras: false,
             validation_flips: false,
             takeover_weight: 1.0,
+            simulator_share: USUAL_SIMULATOR_SHARE,
         }
     }
+}
+
+/// Half of what is seen is the user's own.
+const USUAL_SIMULATOR_SHARE: f64 = 0.5;
+
+fn is_usual_share(share: &f64) -> bool {
+    *share == USUAL_SIMULATOR_SHARE
 }
 
 fn is_one(weight: &f64) -> bool {
@@ -150,6 +162,9 @@ impl SampleSpec {
         }
         if self.min_throttle.is_some_and(|x| !x.is_finite()) {
             return Err(Error::Usage("[samples] min_throttle: must be a finite number".into()));
+        }
+        if !(self.simulator_share > 0.0 && self.simulator_share <= 0.95) {
+            return Err(Error::Usage("[samples] simulator_share: must be more than 0 and at most 0.95".into()));
         }
         if !(0.0..=100.0).contains(&self.takeover_weight) {
             return Err(Error::Usage("[samples] takeover_weight: must be 0 to 100".into()));
@@ -235,6 +250,11 @@ mod tests {
         assert_eq!(read("side_cameras = 0").unwrap().side_cameras, Some(Correction::Fixed(0.0)));
         assert_eq!(read("side_cameras = 'wide'"), Err("expected a number or \"geometry\"".into()));
         assert!(!toml::to_string(&spec).unwrap().contains("mirror"), "recipes of today are written as they were");
+        assert!(!toml::to_string(&spec).unwrap().contains("simulator"));
+        for (text, named) in [("simulator_share = 0", "simulator_share"), ("takeover_weight = -1", "takeover_weight")] {
+            let error = toml::from_str::<SampleSpec>(text).unwrap().validate().unwrap_err().to_string();
+            assert!(error.contains(named), "{error}");
+        }
         assert!(toml::from_str::<SampleSpec>("flips = 'both'").is_err());
         assert!(SampleSpec { side_cameras: Some(Correction::Fixed(25.0)), ..spec }.validate().is_err());
         assert!(Balance { keep_zero: Some(1.5), ..Default::default() }.validate().is_err());

@@ -88,6 +88,10 @@ pub struct Split {
     pub whole: bool,
     /// Training rows.
     pub training: Vec<Item>,
+    /// How often each of them counts in an epoch; each once if this is empty.
+    pub times: Vec<u32>,
+    /// Rows of the simulator's set, of which each epoch draws some.
+    pub simulator: Vec<Item>,
     /// Validation rows.
     pub validation: Vec<Item>,
     /// Rows next to validation blocks, used on neither side.
@@ -96,6 +100,8 @@ pub struct Split {
     pub low_throttle_rows: usize,
     /// Rows left out because the driven path does not say how to steer.
     pub unlabelled_rows: usize,
+    /// Whether some of them are without because their recording lacks a label beside the steering.
+    pub unrecorded: bool,
     /// Rows left out to balance the labels.
     pub balanced_rows: usize,
     /// What the reader should know.
@@ -124,10 +130,13 @@ pub fn split(
         spec: spec.clone(),
         whole: false,
         training: Vec::new(),
+        times: Vec::new(),
+        simulator: Vec::new(),
         validation: Vec::new(),
         guard_rows: 0,
         low_throttle_rows: 0,
         unlabelled_rows: 0,
+        unrecorded: targets.unrecorded(),
         balanced_rows: 0,
         notices: Vec::new(),
     };
@@ -181,10 +190,14 @@ impl Split {
             self.validation.len(),
             images(&self.validation)
         )];
+        let unlabelled = match self.unrecorded {
+            false => "left out because the car stands or its session ends, so that no path lies ahead",
+            true => "left out because a label was not recorded, or the car stands or its session ends",
+        };
         for (rows, why) in [
             (self.guard_rows, "within 1 s of a validation block, used on neither side"),
             (self.low_throttle_rows, "left out for low throttle"),
-            (self.unlabelled_rows, "left out because the car stands or its session ends, so that no path lies ahead"),
+            (self.unlabelled_rows, unlabelled),
             (self.balanced_rows, "left out to balance the labels"),
         ] {
             if rows > 0 {
@@ -200,16 +213,53 @@ impl Split {
     ///
     /// # Errors
     /// [`Error::Usage`] for too many recordings.
-    pub fn train_on(&mut self, recordings: &[Recording], first: usize) -> Result<()> {
+    pub fn train_on(&mut self, recordings: &[Recording], first: usize, targets: &Targets) -> Result<()> {
         if recordings.len() > usize::from(u16::MAX) {
             return Err(Error::Usage("more than 65,535 recordings".into()));
         }
-        let views: Vec<Item> =
+        let mut views: Vec<Item> =
             all_rows(recordings).into_iter().filter(|item| usize::from(item.recording) >= first).collect();
+        // Only a label beside the steering can be missing: a view has been given its steering.
+        self.unlabelled_rows += drop_unlabelled(&mut views, targets);
         if !views.is_empty() {
             self.notices.push(format!("{} views that a model met are trained on as well", views.len()));
         }
         self.training.extend(views);
+        Ok(())
+    }
+
+    /// All rows that are trained on, those of the simulator last.
+    pub fn trained_on(&self) -> impl Iterator<Item = &Item> {
+        self.training.iter().chain(&self.simulator)
+    }
+
+    /// Takes the rows of `recordings` from number `first` on, whose labels are among `targets`, as those of the simulator's set.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] for too many recordings, [`Error::Data`] if no row is left.
+    pub fn draw_from(
+        &mut self,
+        recordings: &[Recording],
+        first: usize,
+        targets: &Targets,
+        samples: &SampleSpec,
+        balance: &Balance,
+        seed: u64,
+    ) -> Result<()> {
+        if recordings.len() > usize::from(u16::MAX) {
+            return Err(Error::Usage("more than 65,535 recordings".into()));
+        }
+        let mut rows: Vec<Item> =
+            all_rows(recordings).into_iter().filter(|item| usize::from(item.recording) >= first).collect();
+        drop_low_throttle(&mut rows, recordings, samples);
+        drop_unlabelled(&mut rows, targets);
+        balance.apply(&mut rows, targets, seed);
+        set_cameras(&mut rows, recordings, samples.side_cameras.is_some());
+        if rows.is_empty() {
+            let message = "the recipe leaves out all of its rows".into();
+            return Err(Error::Data { place: "the simulator's set".into(), message });
+        }
+        self.simulator = rows;
         Ok(())
     }
 

@@ -55,10 +55,13 @@ pub fn split_whole(
         spec,
         whole: true,
         training,
+        times: Vec::new(),
+        simulator: Vec::new(),
         validation,
         guard_rows: 0,
         low_throttle_rows,
         unlabelled_rows,
+        unrecorded: targets.unrecorded(),
         balanced_rows,
         notices,
     })

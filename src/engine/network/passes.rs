@@ -20,6 +20,8 @@ pub(super) struct StepContext<'a> {
     pub moments: &'a [f32],
     pub moments_of: &'a [Range<usize>],
     pub first_learning: usize,
+    /// Weight of each output in the loss; empty for 1 / outputs each.
+    pub output_weights: &'a [f32],
     pub input: StepSlices<'a>,
     pub times: &'a StepTimes,
 }
@@ -85,15 +87,26 @@ impl<'a> StepContext<'a> {
             None => &self.input.x[images.start * outputs..images.end * outputs],
         };
         let labels = &self.input.labels[images.start * outputs..images.end * outputs];
-        let scale = 1.0 / self.input.labels.len() as f32;
+        let count = self.loss_count();
+        let scale = 1.0 / count as f32;
         let gradient = &mut shard.buffers.d_output[..predictions.len()];
-        shard.loss += loss.value_and_gradient(predictions, labels, scale, gradient);
+        let weights = self.output_weights;
+        shard.loss += match weights {
+            [] => loss.value_and_gradient(predictions, labels, scale, gradient),
+            _ => loss.weighted_value_and_gradient(predictions, labels, weights, scale, gradient),
+        };
         if self.input.pairs.images() > 0 {
-            // The sum over the batch is divided by the number of labels in the end.
-            let of_mean = self.input.pairs.add(images, outputs, predictions, labels, gradient);
-            shard.loss += of_mean * self.input.labels.len() as f64;
+            // The sum over the batch is divided by the count in the end.
+            let of_mean = self.input.pairs.add(images, outputs, weights, predictions, labels, gradient);
+            shard.loss += of_mean * count as f64;
         }
         shard.buffers.in_place = false;
+    }
+
+    /// What the sum of the losses of the batch is divided by: the number of labels, or of images if the outputs have weights.
+    pub fn loss_count(&self) -> usize {
+        let labels = self.input.labels.len();
+        if self.output_weights.is_empty() { labels } else { labels / self.output_weights.len() }
     }
 
     /// Backward pass of `stages`: from the gradient of the last one's output to that of the first one's input.

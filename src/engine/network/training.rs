@@ -73,7 +73,11 @@ pub struct TrainingPlan {
     segment_groups: Vec<usize>,
     /// The first stage that learns: no gradient is computed before it.
     first_learning: usize,
+    /// Weight of each output in the loss; empty for 1 / outputs each.
+    output_weights: Vec<f32>,
     capacity: usize,
+    /// Outputs of the network.
+    outputs: usize,
     isa: Isa,
     /// [`Network::fingerprint`] of the network it was planned for.
     fingerprint: u64,
@@ -154,6 +158,7 @@ impl TrainingPlan {
             gradient: vec![0.0; network.count(true)],
             chunk_squares: vec![0.0; network.count(true).div_ceil(CHUNK)],
             first_learning: stages.iter().position(|stage| stage.learns(network)).unwrap_or(stages.len()),
+            output_weights: Vec::new(),
             times: StepTimes::off(stages.len()),
             packed: stages
                 .iter()
@@ -167,9 +172,21 @@ impl TrainingPlan {
             segments,
             segment_groups,
             capacity,
+            outputs: network.output().len(),
             isa: network.isa(),
             fingerprint: network.fingerprint(),
         }
+    }
+
+    /// The same, where the loss is the mean over the images of the losses of all outputs, that of output `k` times `weights[k]`.
+    /// Without weights each counts 1 / outputs.
+    ///
+    /// # Panics
+    ///
+    /// Panics if there is not one weight for each output.
+    pub fn with_output_weights(self, weights: &[f32]) -> TrainingPlan {
+        assert_eq!(weights.len(), self.outputs, "a weight for each output of the network");
+        TrainingPlan { output_weights: weights.to_vec(), ..self }
     }
 
     /// Gradient of the mean loss of the last step with respect to [`Parameters::values`].
@@ -231,7 +248,8 @@ impl TrainingPlan {
             self.backward_with_barriers(network, parameters, input, used);
         }
         self.reduce_gradient(network, used);
-        self.shards[..used].iter().map(|shard| shard.loss).sum::<f64>() / input.labels.len() as f64
+        let count = input.labels.len() / self.output_weights.len().max(1);
+        self.shards[..used].iter().map(|shard| shard.loss).sum::<f64>() / count as f64
     }
 
     /// Lets the running statistics go on over one batch as [`step`](TrainingPlan::step) does, and changes nothing else: the forward
@@ -315,12 +333,23 @@ impl TrainingPlan {
             moments,
             moments_of,
             first_learning,
+            output_weights,
             times,
             ..
         } = self;
         let first_learning = *first_learning;
-        let run =
-            StepContext { network, parameters, stages, packed, moments, moments_of, first_learning, input, times };
+        let run = StepContext {
+            network,
+            parameters,
+            stages,
+            packed,
+            moments,
+            moments_of,
+            first_learning,
+            output_weights,
+            input,
+            times,
+        };
         shards[..used].par_iter_mut().for_each(|shard| {
             shard.reset();
             shard.buffers = spare_buffers.take();
@@ -360,6 +389,7 @@ impl TrainingPlan {
             segments,
             segment_groups,
             first_learning,
+            output_weights,
             times,
             ..
         } = self;
@@ -369,8 +399,18 @@ impl TrainingPlan {
         let barrier = |stage: usize| barrier_of(stages, network, stage);
         let wanted = segments.len() - usize::from(loss.is_none());
         for (index, segment) in segments[..wanted].iter().enumerate() {
-            let run =
-                StepContext { network, parameters, stages, packed, moments, moments_of, first_learning, input, times };
+            let run = StepContext {
+                network,
+                parameters,
+                stages,
+                packed,
+                moments,
+                moments_of,
+                first_learning,
+                output_weights,
+                input,
+                times,
+            };
             let next_barrier = segments.get(index + 1).map(|next| next.start);
             shards.par_iter_mut().for_each(|shard| {
                 if index == 0 {
@@ -414,6 +454,7 @@ impl TrainingPlan {
             segments,
             segment_groups,
             first_learning,
+            output_weights,
             times,
             ..
         } = self;
@@ -423,8 +464,18 @@ impl TrainingPlan {
         let barrier = |stage: usize| barrier_of(stages, network, stage);
         let last = segments.len() - 1;
         for (index, segment) in segments.iter().enumerate().rev() {
-            let run =
-                StepContext { network, parameters, stages, packed, moments, moments_of, first_learning, input, times };
+            let run = StepContext {
+                network,
+                parameters,
+                stages,
+                packed,
+                moments,
+                moments_of,
+                first_learning,
+                output_weights,
+                input,
+                times,
+            };
             // The stage at the start of a segment waits for the sums over all shards.
             let rest = if index > 0 { segment.start + 1..segment.end } else { segment.clone() };
             shards.par_iter_mut().for_each(|shard| {

@@ -28,6 +28,8 @@ impl KerasLayer {
 #[derive(Debug)]
 pub(super) struct Chain {
     pub layers: Vec<KerasLayer>,
+    /// How many layers at the end read the same one, each giving outputs of its own, in the order of the outputs; 1 in a plain chain.
+    pub heads: usize,
     /// Reasons why the layers form no chain. If there are any, the layers stand in the order of the file.
     pub problems: Vec<Problem>,
 }
@@ -66,14 +68,69 @@ pub(super) fn chain(text: &str) -> Result<Chain, String> {
         nodes.push(node(index, entry)?);
     }
     if nodes.iter().all(|node| node.inputs.is_none()) {
-        return Ok(Chain { layers: nodes.into_iter().map(|node| node.layer).collect(), problems: Vec::new() });
+        return Ok(Chain {
+            layers: nodes.into_iter().map(|node| node.layer).collect(),
+            heads: 1,
+            problems: Vec::new(),
+        });
     }
+    let heads = heads(&nodes, config);
+    let is_head = |node: &&Node| heads.contains(&node.layer.name.as_str());
+    // The trunk and one of the heads are a chain.
+    let names: Vec<String> = heads.iter().map(|name| name.to_string()).collect();
+    let first = names.first().cloned();
+    let chained: Vec<usize> = (nodes.iter().enumerate())
+        .filter(|(_, node)| !is_head(node) || Some(&node.layer.name) == first.as_ref())
+        .map(|(index, _)| index)
+        .collect();
+    let (of_chain, others): (Vec<_>, Vec<_>) =
+        nodes.into_iter().enumerate().partition(|(index, _)| chained.contains(index));
+    let nodes: Vec<Node> = of_chain.into_iter().map(|(_, node)| node).collect();
+    let mut others: Vec<KerasLayer> = others.into_iter().map(|(_, node)| node.layer).collect();
+    others.sort_by_key(|layer| names.iter().position(|name| *name == layer.name));
     let found = order(&nodes);
     let layers: Vec<KerasLayer> = nodes.into_iter().map(|node| node.layer).collect();
-    Ok(match found {
-        Ok(order) => Chain { layers: order.into_iter().map(|index| layers[index].clone()).collect(), problems: vec![] },
-        Err(problems) => Chain { layers, problems },
-    })
+    let (mut layers, problems) = match found {
+        Ok(order) => (order.into_iter().map(|index| layers[index].clone()).collect::<Vec<_>>(), vec![]),
+        Err(problems) => (layers, problems),
+    };
+    layers.extend(others);
+    Ok(Chain { layers, heads: names.len().max(1), problems })
+}
+
+/// Names of the dense layers that read one and the same layer and are read by none, in the order of the model's outputs; empty if there
+/// is but one, or something else is read by none.
+fn heads<'a>(nodes: &'a [Node], config: &Value) -> Vec<&'a str> {
+    let sources = |node: &'a Node| match node.inputs.as_deref().unwrap_or_default() {
+        [inputs] => &inputs[..],
+        _ => &[],
+    };
+    let is_read = |name: &str| nodes.iter().any(|node| node.inputs.iter().flatten().flatten().any(|from| from == name));
+    let ends: Vec<&Node> = nodes.iter().filter(|node| !is_read(&node.layer.name)).collect();
+    let source = ends.first().map_or(&[][..], |node| sources(node));
+    let together = source.len() == 1
+        && ends.iter().all(|node| node.layer.class == "Dense" && sources(node) == source)
+        && !source.iter().any(|name| ends.iter().any(|node| node.layer.name == *name));
+    if ends.len() < 2 || !together {
+        return Vec::new();
+    }
+    let outputs: Vec<String> = config.get("output_layers").map(names_of_outputs).unwrap_or_default();
+    let mut heads: Vec<&str> = ends.iter().map(|node| node.layer.name.as_str()).collect();
+    // Stable: what the file does not list keeps its order.
+    heads.sort_by_key(|name| outputs.iter().position(|output| output == name).unwrap_or(usize::MAX));
+    heads
+}
+
+/// The layers in `output_layers`: `[["a", 0, 0], ["b", 0, 0]]`, or one alone: `["a", 0, 0]`.
+fn names_of_outputs(listed: &Value) -> Vec<String> {
+    match listed {
+        Value::Array(parts) => match parts.first() {
+            Some(Value::String(name)) => vec![name.clone()],
+            _ => parts.iter().flat_map(names_of_outputs).collect(),
+        },
+        Value::Object(named) => named.values().flat_map(names_of_outputs).collect(),
+        _ => Vec::new(),
+    }
 }
 
 /// A layer and the layers it takes its input from: one entry for each time it is called. `None` in a sequential model.
@@ -192,6 +249,28 @@ mod tests {
             {"class_name": "B", "config": {"name": "b"}, "inbound_nodes": [{"args": [tensor], "kwargs": {"mask": null}}]},
         ]}});
         assert_eq!(names(&keras3), ["a", "b"]);
+    }
+
+    #[test]
+    fn dense_layers_behind_one_trunk_are_outputs_in_the_order_of_the_model() {
+        let dense = |name: &str, from: &str| json!({"class_name": "Dense", "config": {"name": name}, "inbound_nodes": [[[from, 0, 0, {}]]]});
+        let graph = |last: Value| {
+            json!({"config": {
+                "layers": [
+                    {"class_name": "InputLayer", "config": {"name": "in"}, "inbound_nodes": []},
+                    dense("b", "trunk"), dense("a", "trunk"), dense("trunk", "in"), last,
+                ],
+                "output_layers": [["a", 0, 0], ["b", 0, 0], ["c", 0, 0]],
+            }})
+        };
+        let heads = chain(&graph(dense("c", "trunk")).to_string()).unwrap();
+        assert_eq!((heads.heads, heads.problems.len()), (3, 0));
+        let names: Vec<_> = heads.layers.iter().map(|layer| layer.name.as_str()).collect();
+        assert_eq!(names, ["in", "trunk", "a", "b", "c"]);
+        // Outputs of different depth are no heads of one trunk.
+        let other = chain(&graph(dense("c", "in")).to_string()).unwrap();
+        assert_eq!(other.heads, 1);
+        assert!(other.problems.iter().any(|problem| problem.reason.contains("feeds several layers")));
     }
 
     #[test]

@@ -39,7 +39,7 @@ pub(super) struct Context {
     pub flip_kernels: bool,
 }
 
-/// Puts the chain together.
+/// Puts the chain together; the last `heads` layers read the same one and become one dense layer with the outputs of all.
 ///
 /// # Errors
 ///
@@ -49,6 +49,7 @@ pub(super) fn assemble(
     layers: &[KerasLayer],
     steps: &[KerasStep],
     tensors: &[Vec<Tensor>],
+    heads: usize,
 ) -> Result<Assembly, Problem> {
     let mut assembler = Assembler {
         context,
@@ -60,9 +61,19 @@ pub(super) fn assemble(
         parameters: Parameters { values: Vec::new(), statistics: Vec::new() },
     };
     let mut ends = Vec::new();
-    for ((layer, step), tensors) in layers.iter().zip(steps).zip(tensors) {
+    let trunk = if heads > 1 { layers.len() - heads } else { layers.len() };
+    for ((layer, step), tensors) in layers.iter().zip(steps).zip(tensors).take(trunk) {
         assembler.step(step, tensors).map_err(|reason| layer.problem(reason))?;
         ends.push(assembler.specs.len());
+    }
+    let mut of_heads = Vec::new();
+    for ((layer, step), tensors) in layers.iter().zip(steps).zip(tensors).skip(trunk) {
+        let head = assembler.head(step, tensors);
+        of_heads.push(head.map_err(|reason| layer.problem(reason))?);
+    }
+    if let Some(first) = layers.get(trunk) {
+        assembler.push_heads(&of_heads).map_err(|reason| first.problem(reason))?;
+        ends.extend(vec![assembler.specs.len(); of_heads.len()]);
     }
     Ok(Assembly { specs: assembler.specs, parameters: assembler.parameters, ends })
 }
@@ -157,6 +168,36 @@ impl Assembler<'_> {
         }
         values.extend(bias.unwrap_or_else(|| vec![0.0; oc]));
         self.push(spec.clone().into(), values, Vec::new())
+    }
+
+    /// Weights and biases of a layer that gives outputs of its own.
+    fn head(&self, step: &KerasStep, tensors: &[Tensor]) -> Result<(Vec<f32>, Vec<f32>), String> {
+        let Operation::Dense { units, bias } = step.operation else {
+            return Err("is one of several outputs, and no dense layer".into());
+        };
+        if step.activation.is_some() {
+            return Err("is one of several outputs with an activation of its own, which has no counterpart".into());
+        }
+        if !self.is_flat && self.shape.positions() > 1 {
+            return Err("is one of several outputs and reads a map; a flatten has to stand before it".into());
+        }
+        let inputs = self.shape.len();
+        let mut read = expect(tensors, &[Some(&[inputs, units]), bias.then_some(&[units])])?.into_iter();
+        let (kernel, bias) = (read.next().flatten().unwrap_or_default(), read.next().flatten());
+        let places = self.interleaved.map_or_else(|| (0..inputs).collect(), interleaved_places);
+        let of_unit = |unit: usize| places.iter().map(move |place| place * units + unit);
+        let weights = (0..units).flat_map(of_unit).map(|at| kernel[at]).collect();
+        Ok((weights, bias.unwrap_or_else(|| vec![0.0; units])))
+    }
+
+    /// One dense layer with the units of all `heads`.
+    fn push_heads(&mut self, heads: &[(Vec<f32>, Vec<f32>)]) -> Result<(), String> {
+        self.interleaved = None;
+        let weights = heads.iter().flat_map(|(weights, _)| weights);
+        let biases: Vec<f32> = heads.iter().flat_map(|(_, biases)| biases).copied().collect();
+        let units = biases.len();
+        let values = weights.copied().chain(biases).collect();
+        self.push(DenseSpec { units, init: Initializer::default() }.into(), values, Vec::new())
     }
 
     fn dense(&mut self, units: usize, bias: bool, tensors: &[Tensor]) -> Result<(), String> {

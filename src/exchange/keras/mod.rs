@@ -29,6 +29,7 @@ use self::limits::{MAX_JSON_BYTES, check_size};
 use self::messages::{Problem, listed, shown};
 use self::translate::{AxisOrder, KerasStep, Operation};
 use crate::dataset::preprocess::Preprocessing;
+use crate::dataset::{OutputKind, Outputs};
 use crate::engine::network::{LayerSpec, Network, Parameters};
 use crate::engine::tensor::Shape;
 use crate::error::{Error, Result};
@@ -58,6 +59,8 @@ pub struct Imported {
     pub layers: Vec<LayerSpec>,
     /// Their parameters.
     pub parameters: Parameters,
+    /// What the network gives: the steering, or steering and throttle.
+    pub outputs: Outputs,
     /// Version of Keras that wrote the file, if it says.
     pub keras_version: Option<String>,
     /// What became of each layer of the file.
@@ -104,6 +107,9 @@ impl Imported {
         recipe.insert("epochs".into(), 10.into());
         recipe.insert("batch".into(), 64.into());
         recipe.insert("layers".into(), toml::Value::try_from(&self.layers).map_err(table)?);
+        if !self.outputs.is_default() {
+            recipe.insert("outputs".into(), toml::Value::try_from(&self.outputs).map_err(table)?);
+        }
         recipe.insert("preprocessing".into(), toml::Value::try_from(&preprocessing).map_err(table)?);
         recipe.insert("optimizer".into(), optimizer.into());
         let recipe = Recipe::parse(name, &recipe.to_string(), &[])?;
@@ -127,7 +133,7 @@ pub struct LayerReport {
 ///
 /// # Errors
 ///
-/// [`Error::Io`] if a file cannot be read; [`Error::Data`] if it is damaged, is no model of Keras, gives more than one number,
+/// [`Error::Io`] if a file cannot be read; [`Error::Data`] if it is damaged, is no model of Keras, gives more than two numbers,
 /// or has layers without a counterpart, which are listed with the reason.
 pub fn import(path: &Path, options: &ImportOptions) -> Result<Imported> {
     let file = KerasFile::open(path)?;
@@ -170,15 +176,35 @@ pub fn import(path: &Path, options: &ImportOptions) -> Result<Imported> {
     let tensors = file.weights.of_chain(&chain.layers, &has_weights).map_err(wrong)?;
     let flip_kernels = options.theano_kernels || file.backend.as_deref() == Some("theano");
     let context = Context { input, order, flip_kernels };
-    let assembly = assemble::assemble(&context, &chain.layers, &steps, &tensors).map_err(|p| wrong(listed(&[p])))?;
+    let assembly =
+        assemble::assemble(&context, &chain.layers, &steps, &tensors, chain.heads).map_err(|p| wrong(listed(&[p])))?;
     let Assembly { specs, parameters, ends } = assembly;
     let network = Network::new(input, &specs, Isa::PORTABLE)?;
-    let outputs = network.output().len();
-    if outputs != 1 {
-        return Err(wrong(format!("gives {outputs} numbers for an image; a model here gives one, the steering")));
-    }
-
+    let heads = &chain.layers[chain.layers.len() - chain.heads..];
+    let names: Vec<&str> = heads.iter().map(|layer| layer.name.as_str()).collect();
     let mut notices = Vec::new();
+    let outputs = match (network.output().len(), &names[..]) {
+        (1, _) => Outputs::default(),
+        // No layer of a file is called so by chance.
+        (2, [first, second]) if first.contains("throttle") && !second.contains("throttle") => {
+            return Err(wrong(format!(
+                "gives `{}` before `{}`: a model here gives the steering first; save it with its outputs in that order",
+                shown(first),
+                shown(second)
+            )));
+        }
+        (2, _) => {
+            let named = names.iter().map(|name| format!("`{}`", shown(name))).collect::<Vec<_>>().join(" and ");
+            notices.push(format!("gives two numbers ({named}): the first counts as steering, the second as throttle"));
+            Outputs::with(OutputKind::Throttle, None)
+        }
+        (outputs, _) => {
+            return Err(wrong(format!(
+                "gives {outputs} numbers for an image; a model here gives one, the steering, or two, steering and throttle"
+            )));
+        }
+    };
+
     let mut report = Vec::new();
     let mut start = 0;
     for ((layer, step), end) in chain.layers.iter().zip(&steps).zip(ends) {
@@ -186,7 +212,8 @@ pub fn import(path: &Path, options: &ImportOptions) -> Result<Imported> {
         let (name, class) = (shown(&layer.name), shown(&layer.class));
         notices.extend(step.notice.map(|notice| format!("{name} ({class}): {notice}")));
         report.push(LayerReport { layer: name, class, becomes });
-        start = end;
+        // The heads are one layer.
+        start = if chain.heads > 1 && end == network.layers().len() { start } else { end };
     }
     if order == AxisOrder::ChannelsFirst && file.backend.is_none() && !flip_kernels {
         notices.push(
@@ -195,7 +222,7 @@ pub fn import(path: &Path, options: &ImportOptions) -> Result<Imported> {
                 .into(),
         );
     }
-    Ok(Imported { input, layers: specs, parameters, keras_version: file.keras_version, report, notices })
+    Ok(Imported { input, layers: specs, parameters, outputs, keras_version: file.keras_version, report, notices })
 }
 
 fn read_architecture(path: &Path) -> Result<String> {

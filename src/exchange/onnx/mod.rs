@@ -2,9 +2,11 @@
 //!
 //! The graph uses operators of opset 17 only, with a free batch dimension `N`. It takes either the preprocessed picture,
 //! `input` float `[N, c, h, w]`, or with the preprocessing in the graph the camera image, `image` uint8
-//! `[N, height, width, 3]` in RGB at the recipe's `source` size. It gives `steering` float `[N, 1]`.
+//! `[N, height, width, 3]` in RGB at the recipe's `source` size. It gives `steering` float `[N, 1]`, and of a model with more outputs
+//! `throttle` or `speed` behind it, float `[N, 1]` too.
 //!
-//! The metadata has `label` (the unit), `full_lock_deg`, `recipe` (TOML text) and `steersman_version`.
+//! The metadata has `label` (the units), `full_lock_deg`, `top_speed_mph` (of models that give a speed), `recipe` (TOML text) and
+//! `steersman_version`.
 
 mod graph;
 mod preprocessing;
@@ -16,9 +18,10 @@ use steersman_kernels::Isa;
 use self::graph::{GraphBuilder, float, int, ints};
 use self::proto::{DataType, ModelProto, OperatorSetIdProto, StringStringEntryProto};
 use super::chain::{ChainStep, chain, check_finite, fold_batch_norm};
+use crate::dataset::Outputs;
 use crate::engine::layers::{ExportForm, Formula, Function};
 use crate::error::{Error, Result};
-use crate::model_file::{LABEL, Model};
+use crate::model_file::Model;
 
 /// Version of the set of standard operators. ONNX Runtime reads it from 1.12 (2022) on.
 pub const OPSET: i64 = 17;
@@ -65,10 +68,13 @@ pub fn onnx(model: &Model, options: OnnxOptions) -> Result<Vec<u8>> {
         );
         graph.input("input", DataType::Float, &[c, h, w], &doc);
     }
-    network(&mut graph, &steps, "input", "steering");
-    graph.output("steering", DataType::Float, &[1], LABEL);
+    network(&mut graph, &steps, "input", &recipe.outputs);
+    for output in recipe.outputs.specs() {
+        graph.output(output.name.name(), DataType::Float, &[1], &recipe.outputs.meaning(output.name));
+    }
 
     let entry = |key: &str, value: String| StringStringEntryProto { key: key.into(), value };
+    let top_speed = recipe.outputs.top_speed_mph().map(|mph| entry("top_speed_mph", mph.to_string()));
     let model = ModelProto {
         ir_version: IR_VERSION,
         producer_name: "steersman".into(),
@@ -76,12 +82,15 @@ pub fn onnx(model: &Model, options: OnnxOptions) -> Result<Vec<u8>> {
         doc_string: recipe.about.clone(),
         graph: Some(graph.finish(&recipe.name)),
         opset_import: vec![OperatorSetIdProto { domain: String::new(), version: OPSET }],
-        metadata_props: vec![
-            entry("label", LABEL.into()),
+        metadata_props: [
+            entry("label", recipe.outputs.label()),
             entry("full_lock_deg", recipe.full_lock_deg.to_string()),
             entry("recipe", recipe.to_toml()?),
             entry("steersman_version", env!("CARGO_PKG_VERSION").into()),
-        ],
+        ]
+        .into_iter()
+        .chain(top_speed)
+        .collect(),
     };
     Ok(model.encode_to_vec())
 }
@@ -98,8 +107,8 @@ fn check_size(steps: &[ChainStep]) -> Result<()> {
     Ok(())
 }
 
-/// Adds the nodes of the network, which reads `input`, `[N, c, h, w]`, and gives `output`, `[N, 1]`.
-fn network(graph: &mut GraphBuilder, steps: &[ChainStep], input: &str, output: &str) {
+/// Adds the nodes of the network, which reads `input`, `[N, c, h, w]`, and gives each of `outputs`, `[N, 1]`.
+fn network(graph: &mut GraphBuilder, steps: &[ChainStep], input: &str, outputs: &Outputs) {
     let mut value = input.to_string();
     // A vector is [N, c] in ONNX, and [N, c, 1, 1] for the layers of maps.
     let mut is_map = true;
@@ -133,7 +142,16 @@ fn network(graph: &mut GraphBuilder, steps: &[ChainStep], input: &str, output: &
     if is_map {
         value = graph.node("Flatten", "vector", &[&value], vec![int("axis", 1)]);
     }
-    graph.node("Identity", output, &[&value], vec![]);
+    let names: Vec<&str> = outputs.specs().iter().map(|output| output.name.name()).collect();
+    match names[..] {
+        [only] => {
+            graph.node("Identity", only, &[&value], vec![]);
+        }
+        _ => {
+            let lengths = graph.int64s("outputs.lengths", &vec![1; names.len()]);
+            graph.node_with_outputs("Split", "outputs", &[&value, &lengths], &names, vec![int("axis", 1)]);
+        }
+    }
 }
 
 /// Adds the nodes of one step and returns the name of its result.
@@ -271,6 +289,23 @@ mod tests {
                 assert!(known.contains("steering"), "{name}");
             }
         }
+    }
+
+    #[test]
+    fn several_outputs_have_their_names_in_the_order_of_the_recipe() {
+        let set = ["layers.last.units=2", "outputs=[{ name = 'steering' }, { name = 'speed', top_speed_mph = 28.5 }]"];
+        let recipe = Recipe::find("lenet", &set.map(String::from)).unwrap();
+        let parameters = recipe.network(Isa::PORTABLE).unwrap().initialize(1);
+        let model = Model { recipe, parameters, record: TrainingRecord::default(), training_rows: vec![] };
+        let decoded = ModelProto::decode(onnx(&model, OnnxOptions::default()).unwrap().as_slice()).unwrap();
+        let graph = decoded.graph.unwrap();
+        let names: Vec<&str> = graph.output.iter().map(|output| output.name.as_str()).collect();
+        assert_eq!(names, ["steering", "speed"]);
+        let split = graph.node.last().unwrap();
+        assert_eq!((split.op_type.as_str(), &split.output[..]), ("Split", &["steering".into(), "speed".into()][..]));
+        let entry = |key: &str| decoded.metadata_props.iter().find(|entry| entry.key == key).unwrap().value.clone();
+        assert_eq!(entry("top_speed_mph"), "28.5");
+        assert!(entry("label").contains("speed: speed to drive at; times 28.5"), "{}", entry("label"));
     }
 
     #[test]

@@ -3,8 +3,10 @@
 use std::fmt::Write as _;
 
 use super::program::{Arg, Array, Buffer, Program, Statement, Values, expression, pick_sections, statement, wrap};
+use crate::dataset::OutputKind;
 
 const LIBRARY: &str = include_str!("library.c");
+const IMAGE: &str = "const uint8_t image[STEER_HEIGHT * STEER_WIDTH * 3]";
 
 /// The text of the file.
 pub fn write(program: &Program) -> String {
@@ -36,7 +38,22 @@ fn write_to(text: &mut String, program: &Program) -> std::fmt::Result {
     writeln!(text, "#include <stdint.h>\n")?;
     writeln!(text, "#define STEER_HEIGHT {height}\n#define STEER_WIDTH {width}")?;
     writeln!(text, "#define STEER_FULL_LOCK_DEG {:?}\n", recipe.full_lock_deg)?;
-    writeln!(text, "float steer(const uint8_t image[STEER_HEIGHT * STEER_WIDTH * 3]);\n")?;
+    let outputs = &recipe.outputs;
+    if outputs.count() > 1 {
+        writeln!(text, "/* The places of the outputs. */")?;
+        let name = |kind: OutputKind| format!("STEER_{}", kind.name().to_uppercase());
+        let places: Vec<String> = outputs.specs().iter().map(|output| name(output.name)).collect();
+        writeln!(text, "enum {{ {}, STEER_OUTPUTS }};", places.join(", "))?;
+        if let Some(mph) = outputs.top_speed_mph() {
+            writeln!(text, "#define STEER_TOP_SPEED_MPH {mph:?}")?;
+        }
+        writeln!(text, "\n/* All outputs for a camera image; none is clamped.")?;
+        for output in outputs.specs() {
+            writeln!(text, " * {}: {}", name(output.name), outputs.meaning(output.name))?;
+        }
+        writeln!(text, " */\nvoid steer_outputs({IMAGE}, float outputs[STEER_OUTPUTS]);\n")?;
+    }
+    writeln!(text, "float steer({IMAGE});\n")?;
     for array in &program.tables {
         write_array(text, array)?;
     }
@@ -52,7 +69,10 @@ fn write_to(text: &mut String, program: &Program) -> std::fmt::Result {
         let kind = if buffer.holds_bytes() { "uint8_t" } else { "float" };
         writeln!(text, "static {kind} {}[{len}];", buffer.name())?;
     }
-    writeln!(text, "\nfloat steer(const uint8_t image[STEER_HEIGHT * STEER_WIDTH * 3]) {{")?;
+    match outputs.count() {
+        1 => writeln!(text, "\nfloat steer({IMAGE}) {{")?,
+        _ => writeln!(text, "\nvoid steer_outputs({IMAGE}, float outputs[STEER_OUTPUTS]) {{")?,
+    }
     for step in &program.statements {
         match step {
             Statement::Call { comment, function, args } => {
@@ -70,7 +90,13 @@ fn write_to(text: &mut String, program: &Program) -> std::fmt::Result {
             }
         }
     }
-    writeln!(text, "    return {}[0];\n}}", program.result.name())
+    let result = program.result.name();
+    if outputs.count() == 1 {
+        return writeln!(text, "    return {result}[0];\n}}");
+    }
+    writeln!(text, "    for (int i = 0; i < STEER_OUTPUTS; i++) {{\n        outputs[i] = {result}[i];\n    }}\n}}\n")?;
+    writeln!(text, "float steer({IMAGE}) {{\n    float outputs[STEER_OUTPUTS];\n    steer_outputs(image, outputs);")?;
+    writeln!(text, "    return outputs[STEER_STEERING];\n}}")
 }
 
 fn write_array(text: &mut String, Array { name, values }: &Array) -> std::fmt::Result {

@@ -33,6 +33,22 @@ fn write_to(text: &mut String, program: &Program) -> std::fmt::Result {
          /// Angle of the front wheels at steering 1, in degrees.\npub const FULL_LOCK_DEG: f32 = {:?};\n",
         recipe.full_lock_deg as f32
     )?;
+    let outputs = &recipe.outputs;
+    if outputs.count() > 1 {
+        writeln!(text, "/// Number of outputs.\npub const OUTPUTS: usize = {};", outputs.count())?;
+        for (place, output) in outputs.specs().iter().enumerate() {
+            let (name, meaning) = (output.name.name().to_uppercase(), outputs.meaning(output.name));
+            writeln!(text, "/// Place among the outputs: {meaning}.\npub const {name}: usize = {place};")?;
+        }
+        if let Some(mph) = outputs.top_speed_mph() {
+            writeln!(
+                text,
+                "/// Speed at an output `speed` of 1, mph.\npub const TOP_SPEED_MPH: f32 = {:?};",
+                mph as f32
+            )?;
+        }
+        writeln!(text)?;
+    }
     let declare = |(buffer, len): &(super::program::Buffer, usize)| {
         format!("    {}: [{}; {len}],\n", buffer.name(), if buffer.holds_bytes() { "u8" } else { "f32" })
     };
@@ -58,8 +74,17 @@ fn write_to(text: &mut String, program: &Program) -> std::fmt::Result {
          /// The caller must check that the camera's frame was decoded without an error, is complete and new, and that the\n    \
          /// result is finite, and clamp it to [-1, 1]. Without such a frame, hold the last good angle for at most 0.5 s, with\n    \
          /// the throttle off, and then brake.\n    \
-         pub fn steer(&mut self, image: &[u8; HEIGHT * WIDTH * 3]) -> f32 {{\n        let Model {{ {names} }} = self;"
+         pub fn steer(&mut self, image: &[u8; HEIGHT * WIDTH * 3]) -> f32 {{"
     )?;
+    if outputs.count() > 1 {
+        writeln!(
+            text,
+            "        self.outputs(image)[STEERING]\n    }}\n\n    \
+             /// All outputs for a camera image, as [`steer`](Model::steer) takes it; none is clamped.\n    \
+             pub fn outputs(&mut self, image: &[u8; HEIGHT * WIDTH * 3]) -> [f32; OUTPUTS] {{"
+        )?;
+    }
+    writeln!(text, "        let Model {{ {names} }} = self;")?;
     for step in &program.statements {
         match step {
             Statement::Call { comment, function, args } => {
@@ -76,7 +101,11 @@ fn write_to(text: &mut String, program: &Program) -> std::fmt::Result {
             }
         }
     }
-    writeln!(text, "        {}[0]\n    }}\n}}\n", program.result.name())?;
+    let result = program.result.name();
+    match outputs.count() {
+        1 => writeln!(text, "        {result}[0]\n    }}\n}}\n")?,
+        _ => writeln!(text, "        core::array::from_fn(|output| {result}[output])\n    }}\n}}\n")?,
+    }
     writeln!(text, "impl Default for Model {{\n    fn default() -> Model {{\n        Model::new()\n    }}\n}}\n")?;
     for array in &program.tables {
         write_array(text, array)?;

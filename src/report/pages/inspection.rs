@@ -242,7 +242,7 @@ fn samples(page: &mut Page, recording: &Recording, recipe: &Recipe, count: usize
     };
     page.paragraph(&format!("From hard left to hard right{used}. A mirrored picture has the negated label."));
     let mut figures = Vec::new();
-    let targets = recipe.targets(std::slice::from_ref(recording));
+    let targets = recipe.steering_targets(std::slice::from_ref(recording));
     for row in from_left_to_right(recording, count) {
         let (line, item) = (recording.rows[row].line, Item::new(0, row as u32, [View::Centre]));
         // The driven path does not say every label.
@@ -387,9 +387,12 @@ fn training(page: &mut Page, recordings: &[Recording], recipe: &Recipe, seed: u6
     let all: Vec<f32> = recordings.iter().flat_map(|r| r.rows.iter().map(|row| row.steering)).collect();
     let before = histogram("Before: labels as recorded", HALF, "rows", &all);
     let (spec, samples, balance) = (&recipe.split, &recipe.samples, &recipe.balance);
-    let targets = recipe.targets(recordings);
-    match crate::dataset::split::split(recordings, &targets, spec, samples, balance, seed) {
-        Ok(split) => {
+    let divided = recipe.targets(recordings, &[], &[]).and_then(|targets| {
+        let split = crate::dataset::split::split(recordings, &targets, spec, samples, balance, seed)?;
+        Ok((targets, split))
+    });
+    match divided {
+        Ok((targets, split)) => {
             let view = SplitView::of(recordings, &targets, &split, recipe);
             view.describe(page);
             page.subsection("Balance of the labels");

@@ -79,7 +79,7 @@ fn page(folder: &RunFolder, path: &Path) -> Result<String> {
         worst(&mut page, &answers, &data, recipe.full_lock_deg);
     }
     page.section("Data");
-    let view = SplitView::of(data.recordings(), data.targets(), data.split(), &recipe);
+    let view = SplitView::of(data.without_simulator(), data.targets(), data.split(), &recipe);
     view.describe(&mut page);
     let title = "Labels of an epoch's training images";
     page.drawings(&[histogram(title, HALF, "images", &view.training_labels)]);
@@ -127,7 +127,14 @@ fn headline(page: &mut Page, result: &TrainResult, alone: bool) {
         ["speed".into(), format!("{:.0} images/s", result.images_per_second)],
         ["leak".into(), format!("{:.1} %", result.leak_percent)],
     ];
-    page.table(&["", ""], &rows.map(Vec::from));
+    let mut rows = rows.map(Vec::from).to_vec();
+    if let Some(mae) = result.val_throttle_mae {
+        rows.insert(4, vec!["centre camera: MAE of the throttle".into(), format!("{mae:.3}")]);
+    }
+    if let Some(mae) = result.val_speed_mae_mph {
+        rows.insert(4, vec!["centre camera: MAE of the speed".into(), format!("{mae:.2} mph")]);
+    }
+    page.table(&["", ""], &rows);
 }
 
 /// What the model is worth on the recordings it was trained on.
@@ -403,13 +410,12 @@ fn layer_table(page: &mut Page, network: &Network) {
 
 fn environment(page: &mut Page, info: &RunInfo, history: &[EpochRecord]) {
     let cores = std::thread::available_parallelism().map_or("-".into(), |n| n.to_string());
-    let recordings: Vec<String> = info.recordings.iter().map(|path| path.display().to_string()).collect();
     let rows = [
         ["version".to_string(), format!("steersman {}", info.version)],
         ["vector code".into(), info.isa.clone()],
         ["convolution algorithm".into(), info.algorithm.clone().unwrap_or_else(|| "auto".into())],
         ["seed".into(), info.seed.to_string()],
-        ["recordings".into(), recordings.join(", ")],
+        ["recordings".into(), info.trained_on().join(", ")],
         ["hash of the rows".into(), info.rows_hash.clone()],
         [
             "this page was written on".into(),

@@ -177,8 +177,19 @@ impl Strip {
 }
 
 fn training_labels(targets: &Targets, split: &Split, recipe: &Recipe) -> Vec<f32> {
-    let labels = (split.training.iter())
-        .flat_map(|&item| item.cameras().map(move |camera| recipe.samples.label(targets, item, camera)));
+    let of_item = |item: &Item| -> Vec<f32> {
+        item.cameras().map(|camera| recipe.samples.label(targets, *item, camera)).collect()
+    };
+    let times = |row: usize| split.times.get(row).map_or(1, |times| *times as usize);
+    let own = split.training.iter().enumerate();
+    let own: Vec<f32> =
+        own.flat_map(|(row, item)| std::iter::repeat_n(of_item(item), times(row))).flatten().collect::<Vec<f32>>();
+    // An epoch draws some of the simulator's at random; here they are spread evenly.
+    let simulator: Vec<f32> = split.simulator.iter().flat_map(of_item).collect();
+    let share = recipe.samples.simulator_share;
+    let drawn = ((share / (1.0 - share) * own.len() as f64).round() as usize).min(simulator.len());
+    let drawn = (0..drawn).map(|k| simulator[k * simulator.len() / drawn]);
+    let labels = own.into_iter().chain(drawn);
     match recipe.samples.flip {
         Flip::None => labels.collect(),
         Flip::Both => labels.flat_map(|label| [label, -label]).collect(),
@@ -203,7 +214,7 @@ mod tests {
         let labels: Vec<f32> = (0..1200).map(|i| if i % 3 == 0 { 0.0 } else { 0.3 }).collect();
         let recordings = [recording_of(&labels, 100)];
         let recipe = Recipe::find("lenet", &[]).unwrap();
-        let targets = recipe.targets(&recordings);
+        let targets = recipe.targets(&recordings, &[], &[]).unwrap();
         let (spec, samples, balance) = (&recipe.split, &recipe.samples, &recipe.balance);
         let split = crate::dataset::split::split(&recordings, &targets, spec, samples, balance, 1).unwrap();
         let view = SplitView::of(&recordings, &targets, &split, &recipe);

@@ -12,6 +12,7 @@ use crate::serve::helm::FrameTime;
 use crate::serve::journal::Incident;
 use crate::serve::recording::{Queued, Recorder};
 use crate::serve::seat::Claim;
+use crate::simulator::DriverAnswer;
 use crate::simulator::car::dynamics::MAX_STEER_DEG;
 use crate::udacity::{ClientPacket, Command, DecimalMark, NumberStyle, Telemetry};
 
@@ -45,8 +46,8 @@ impl Connection<'_, '_> {
         let Some(speed_mph) = telemetry.speed_mph else {
             return self.bad_telemetry(Incident::NoSpeed, format_args!("telemetry without a speed"), blind);
         };
-        let steering = match self.look(image) {
-            Ok(steering) => steering,
+        let answer = match self.look(image) {
+            Ok(answer) => answer,
             Err(text) => return self.bad_telemetry(Incident::UnreadableImage, format_args!("{text}"), blind),
         };
         match self.shared.seat.claim(self.peer.id, &self.peer.stream, Instant::now()) {
@@ -61,7 +62,7 @@ impl Connection<'_, '_> {
         }
         self.faults = 0;
         self.lockstep = telemetry.time_s.is_some();
-        let command = self.helm.command(steering, speed_mph, time);
+        let command = self.helm.command_for(answer, speed_mph, time);
         self.steer(command)?;
         self.cut = false;
         self.shared.statistics().answered(arrived, Instant::now(), command, speed_mph);
@@ -72,8 +73,8 @@ impl Connection<'_, '_> {
         Ok(())
     }
 
-    /// The steering of the model for a picture in base64.
-    fn look(&mut self, image: &str) -> Result<f32, String> {
+    /// The answer of the model to a picture in base64.
+    fn look(&mut self, image: &str) -> Result<DriverAnswer, String> {
         let len = BASE64.decode_len(image.len()).map_err(|_| "an image whose base64 is incomplete".to_string())?;
         self.image.resize(len, 0);
         let len = BASE64
@@ -81,9 +82,10 @@ impl Connection<'_, '_> {
             .map_err(|partial| format!("an image that is not base64: {}", partial.error))?;
         self.image.truncate(len);
         let mut pilot = self.shared.pilot.lock().unwrap_or_else(PoisonError::into_inner);
-        pilot
-            .steer_encoded_within(&self.image, MAX_IMAGE_SIDE)
-            .map_err(|error| format!("an image that cannot be used: {error}"))
+        let answer = pilot
+            .answer_encoded_within(&self.image, MAX_IMAGE_SIDE)
+            .map_err(|error| format!("an image that cannot be used: {error}"))?;
+        Ok(DriverAnswer { steering: answer.steering, pace: pilot.pace(&answer) })
     }
 
     fn learn_style(&mut self, telemetry: &Telemetry) {

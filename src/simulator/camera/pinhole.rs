@@ -88,10 +88,15 @@ pub struct Camera {
 
 impl Camera {
     /// The camera `mount` of a car whose body is at `body`.
+    pub fn new(body: &BodyPose, mount: Mount) -> Camera {
+        Camera::placed(body, mount.place_m(), PITCH_YAW_ROLL_DEG)
+    }
+
+    /// A camera at `place_m` in the body, turned as said: see [`Mount::place_m`] and [`PITCH_YAW_ROLL_DEG`].
     ///
     /// Rotations are applied in Unity's order: roll, then pitch, then yaw.
-    pub fn new(body: &BodyPose, mount: Mount) -> Camera {
-        let [(sp, cp), (sy, cy), (sr, cr)] = PITCH_YAW_ROLL_DEG.map(|deg| {
+    pub fn placed(body: &BodyPose, place_m: [f32; 3], pitch_yaw_roll_deg: [f64; 3]) -> Camera {
+        let [(sp, cp), (sy, cy), (sr, cr)] = pitch_yaw_roll_deg.map(|deg| {
             let (sin, cos) = sin_cos(deg.to_radians());
             (sin as f32, cos as f32)
         });
@@ -100,7 +105,7 @@ impl Camera {
         let yawed = |[x, y, z]: [f32; 3]| [x * cy + z * sy, y, z * cy - x * sy];
         let world = |[x, y, z]: [f32; 3]| body.right * x + body.up * y + body.forward * z;
         Camera {
-            eye: body.origin + world(mount.place_m()),
+            eye: body.origin + world(place_m),
             forward: world(yawed(pitched([0.0, 0.0, 1.0]))),
             right: world(yawed(pitched([cr, sr, 0.0]))),
             up: world(yawed(pitched([-sr, cr, 0.0]))),

@@ -12,10 +12,26 @@ const FIRST_FRAME_S: f64 = 0.05;
 /// Maximum time step of a frame, s.
 const MAX_FRAME_S: f64 = 0.5;
 /// Maximum sideways acceleration of `Speed::Auto` in bends, m/s².
-const COMFORT_MPS2: f64 = 2.5;
+pub const COMFORT_MPS2: f64 = 2.5;
+/// Maximum speed of `Speed::Auto`, mph.
+const AUTO_TOP_MPH: f64 = 30.0;
 
 /// Minimum speed in bends, mph.
 const MIN_BEND_MPH: f64 = 9.0;
+
+/// Speed below which a driver's own pace does not brake, mph: Udacity's simulator drives backwards when it brakes below 5 mph.
+const MIN_BRAKE_MPH: f64 = 5.0;
+/// Throttle that a driver may give for each mph below the limit of its speed.
+const LIMIT_PER_MPH: f64 = 0.5;
+
+/// What a driver asks of the pedals.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Pace {
+    /// Throttle, [-1, 1], negative to brake.
+    Throttle(f32),
+    /// A speed to hold, mph.
+    SpeedMph(f32),
+}
 
 /// The speed a drive aims at.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -24,20 +40,16 @@ pub enum Speed {
     Fixed(f64),
     /// 30 mph, less before and in bends.
     Auto,
+    /// What the driver asks for, at most this, mph; a driver that asks for nothing holds it.
+    Driver(f64),
 }
 
 impl Speed {
     /// The speed to aim at here, mph.
     pub fn target_mph(self, simulation: &Simulation) -> f64 {
         match self {
-            Speed::Fixed(mph) => mph,
-            Speed::Auto => {
-                let sign = if simulation.reverse { -1.0 } else { 1.0 };
-                let sharpest = (0..=12)
-                    .map(|k| simulation.track.at(simulation.location.s_m + sign * f64::from(k) * 2.5).curvature.abs())
-                    .fold(0.0, f64::max);
-                comfortable_mph(sharpest).clamp(MIN_BEND_MPH, 30.0)
-            }
+            Speed::Fixed(mph) | Speed::Driver(mph) => mph,
+            Speed::Auto => before_bends_mph(simulation, AUTO_TOP_MPH, COMFORT_MPS2),
         }
     }
 
@@ -45,21 +57,31 @@ impl Speed {
     pub fn at_start_mps(self) -> f64 {
         match self {
             Speed::Fixed(mph) => mph * MPS_PER_MPH,
-            Speed::Auto => 12.0 * MPS_PER_MPH,
+            Speed::Auto | Speed::Driver(_) => 12.0 * MPS_PER_MPH,
         }
     }
 }
 
-/// The speed of a comfortable bend, mph; `curvature` in 1/m, not negative.
-fn comfortable_mph(curvature: f64) -> f64 {
-    (COMFORT_MPS2 / curvature.max(1e-6)).sqrt() / MPS_PER_MPH
+/// The speed of a driver who knows the way, mph: at most `top_mph`, and before and in bends so slow that the car is pushed sideways by at
+/// most `sideways_mps2`.
+pub fn before_bends_mph(simulation: &Simulation, top_mph: f64, sideways_mps2: f64) -> f64 {
+    let sign = if simulation.reverse { -1.0 } else { 1.0 };
+    let sharpest = (0..=12)
+        .map(|k| simulation.track.at(simulation.location.s_m + sign * f64::from(k) * 2.5).curvature.abs())
+        .fold(0.0, f64::max);
+    bend_mph(sharpest, sideways_mps2).clamp(MIN_BEND_MPH.min(top_mph), top_mph)
+}
+
+/// The speed in a bend of `curvature`, 1/m and not negative, that pushes the car sideways by `sideways_mps2`, mph.
+fn bend_mph(curvature: f64, sideways_mps2: f64) -> f64 {
+    (sideways_mps2 / curvature.max(1e-6)).sqrt() / MPS_PER_MPH
 }
 
 /// The target speed, mph, where `steering`, [-1, 1], is needed: at most `target_mph`, less in bends. For drivers that know
 /// a bend only from their own steering.
 pub fn slower_in_bends_mph(target_mph: f64, steering: f64) -> f64 {
     let curvature = (steering * MAX_STEER_DEG).to_radians().tan().abs() / WHEELBASE_M;
-    comfortable_mph(curvature).clamp(MIN_BEND_MPH.min(target_mph), target_mph)
+    bend_mph(curvature, COMFORT_MPS2).clamp(MIN_BEND_MPH.min(target_mph), target_mph)
 }
 
 /// The speed as telemetry carries it: four decimals, mph.
@@ -85,6 +107,23 @@ impl SpeedController {
         let dt_s = self.last_s.map_or(FIRST_FRAME_S, |last| (time_s - last).clamp(0.0, MAX_FRAME_S));
         self.last_s = Some(time_s);
         self.throttle(target_mph, speed_mph, dt_s) as f32
+    }
+
+    /// As [`throttle_at`](Self::throttle_at), for the pace that a driver asks for, at most `limit_mph`.
+    ///
+    /// A speed is held by this controller. A throttle is passed on, but the nearer the speed is to the limit, the less of it: none at the
+    /// limit, the brake above. Neither brakes a car that hardly moves, which would drive backwards. What is not finite asks for
+    /// nothing: no throttle, no speed.
+    pub fn throttle_for(&mut self, pace: Pace, time_s: f64, limit_mph: f64, speed_mph: f64) -> f32 {
+        let asked = |value: f32| if value.is_finite() { f64::from(value) } else { 0.0 };
+        let throttle = match pace {
+            Pace::SpeedMph(mph) => self.throttle_at(time_s, asked(mph).clamp(0.0, limit_mph), speed_mph),
+            Pace::Throttle(throttle) => {
+                self.last_s = Some(time_s);
+                asked(throttle).min(LIMIT_PER_MPH * (limit_mph - speed_mph)).clamp(-1.0, 1.0) as f32
+            }
+        };
+        if speed_mph < MIN_BRAKE_MPH { throttle.max(0.0) } else { throttle }
     }
 
     /// The throttle, [-1, 1], after `dt_s` more seconds at `speed_mph` where `target_mph` is wanted.
@@ -113,6 +152,37 @@ mod tests {
         let mph = slower_in_bends_mph(30.0, 0.2);
         let radius_m = WHEELBASE_M / 5_f64.to_radians().tan();
         assert!(((mph * MPS_PER_MPH).powi(2) / radius_m - COMFORT_MPS2).abs() < 1e-9, "{mph}");
+    }
+
+    #[test]
+    fn a_drivers_pace_is_followed_up_to_the_limit_and_never_backwards() {
+        let throttle = |pace, limit_mph, mph| SpeedController::default().throttle_for(pace, 1.0, limit_mph, mph);
+        for (asked, limit_mph, mph, expected) in [
+            (0.4, 20.0, 12.0, 0.4),
+            (2.0, 20.0, 12.0, 1.0),
+            (0.9, 20.0, 19.0, 0.5),
+            (0.9, 20.0, 20.0, 0.0),
+            (0.9, 20.0, 21.0, -0.5),
+            (-0.3, 20.0, 12.0, -0.3),
+            (-0.3, 20.0, 4.0, 0.0),
+            (f32::NAN, 20.0, 12.0, 0.0),
+        ] {
+            assert_eq!(throttle(Pace::Throttle(asked), limit_mph, mph), expected, "{asked} at {mph} mph");
+        }
+        let held = |target_mph: f64, mph: f64| SpeedController::default().throttle_at(1.0, target_mph, mph);
+        assert_eq!(throttle(Pace::SpeedMph(17.0), 20.0, 12.0), held(17.0, 12.0));
+        assert_eq!(throttle(Pace::SpeedMph(40.0), 20.0, 12.0), held(20.0, 12.0));
+        assert_eq!(throttle(Pace::SpeedMph(f32::INFINITY), 20.0, 12.0), held(0.0, 12.0));
+        assert_eq!(throttle(Pace::SpeedMph(0.0), 20.0, 3.0), 0.0);
+        // At full throttle a car settles a little below the limit.
+        let (mut car, mut controller) = (Car::new(0.0, 0.0, 1.0, 0.0, 0.0), SpeedController::default());
+        for step in 0..2000 {
+            let (time_s, mph) = (f64::from(step) * STEP_S, car.speed_mps / MPS_PER_MPH);
+            let throttle = f64::from(controller.throttle_for(Pace::Throttle(1.0), time_s, 20.0, mph));
+            car.step(Controls { steering: 0.0, throttle }, 0.0, 0.0);
+            assert!(car.speed_mps / MPS_PER_MPH < 20.0);
+        }
+        assert!(car.speed_mps / MPS_PER_MPH > 18.5, "{}", car.speed_mps / MPS_PER_MPH);
     }
 
     #[test]

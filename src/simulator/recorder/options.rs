@@ -5,8 +5,12 @@ use std::path::Path;
 
 use serde::Serialize;
 
+use crate::geometry::CarGeometry;
 use crate::simulator::car::dynamics::STEPS_PER_S;
 use crate::simulator::car::expert::Style;
+use crate::simulator::car::simulation::Simulation;
+use crate::simulator::car::speed::before_bends_mph;
+use crate::simulator::recorder::foreign_car;
 use crate::simulator::track::Track;
 use crate::{Error, Result};
 
@@ -38,18 +42,27 @@ pub struct RecordOptions {
     pub seed: u64,
     /// Speed to hold, mph.
     pub speed_mph: f64,
+    /// Drive slower than that before and in bends, so that the car is pushed sideways by at most this, m/s².
+    pub bends_mps2: Option<f64>,
     /// Strength of a disturbance of the steering that the labels do not show: standard deviation of the steering.
     pub noise: f64,
     /// Rows of the log for each second: 1, 2, 5, 10, 25 or 50.
     pub hz: u64,
     /// How the log is written.
     pub format: LogFormat,
-    /// The labels are the steering towards the point of the line so far ahead of the rear axle, m, whatever moves the wheel; without
-    /// it they are what the expert does. Seen from farther, a place beside the line asks for less steering.
-    pub label_look_ahead_m: Option<f64>,
+    /// Camera mount and car to record as; those of the simulator if there is none.
+    pub car: Option<CarGeometry>,
 }
 
 impl RecordOptions {
+    /// The speed to aim at in `simulation`, mph.
+    pub fn target_mph(&self, simulation: &Simulation) -> f64 {
+        match self.bends_mps2 {
+            None => self.speed_mph,
+            Some(sideways_mps2) => before_bends_mph(simulation, self.speed_mph, sideways_mps2),
+        }
+    }
+
     /// Checks the options that hold for every driver: speed and rows per second.
     ///
     /// # Errors
@@ -58,8 +71,15 @@ impl RecordOptions {
         if !(5.0..=30.0).contains(&self.speed_mph) {
             return Err(Error::Usage(format!("speed {} mph: 5 to 30 mph can be recorded", self.speed_mph)));
         }
+        if self.bends_mps2.is_some_and(|mps2| !(0.5..=8.0).contains(&mps2)) {
+            let mps2 = self.bends_mps2.unwrap_or_default();
+            return Err(Error::Usage(format!("{mps2} m/s² in bends: 0.5 to 8 can be recorded")));
+        }
         if self.hz == 0 || !STEPS_PER_S.is_multiple_of(self.hz) {
             return Err(Error::Usage(format!("{} rows a second: 1, 2, 5, 10, 25 or 50 can be recorded", self.hz)));
+        }
+        if let Some(trouble) = self.car.as_ref().and_then(foreign_car::trouble) {
+            return Err(Error::Usage(format!("the simulator cannot record with this camera: {trouble}")));
         }
         Ok(())
     }
@@ -74,10 +94,11 @@ impl Default for RecordOptions {
             style: Style::Smooth,
             seed: 1,
             speed_mph: 20.0,
+            bends_mps2: None,
             noise: 0.0,
             hz: RECORD_HZ,
             format: LogFormat::Sample,
-            label_look_ahead_m: None,
+            car: None,
         }
     }
 }
@@ -101,13 +122,13 @@ pub struct RecordingInfo {
     pub style: String,
     /// Speed held, mph; the highest, if by hand.
     pub speed_mph: f64,
+    /// Driven slower than that before and in bends, so that the car was pushed sideways by at most this, m/s².
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub bends_mps2: Option<f64>,
     /// Disturbance of the steering.
     pub noise: f64,
     /// Rows for each second.
     pub hz: u64,
-    /// See [`RecordOptions::label_look_ahead_m`].
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub label_look_ahead_m: Option<f64>,
     /// Rows of the log.
     pub rows: usize,
 }
@@ -124,9 +145,9 @@ impl RecordingInfo {
             recovery: options.recovery,
             style: if options.style == Style::Keyboard { "keyboard" } else { "smooth" }.to_string(),
             speed_mph: options.speed_mph,
+            bends_mps2: options.bends_mps2,
             noise: options.noise,
             hz: options.hz,
-            label_look_ahead_m: options.label_look_ahead_m,
             rows,
         }
     }

@@ -5,10 +5,11 @@ use std::path::Path;
 
 use rayon::prelude::*;
 
-use crate::dataset::DESCRIPTION_FILE;
+use crate::dataset::{DESCRIPTION_FILE, Description};
 use crate::files::new_folder::NewFolder;
 use crate::observer::{Observer, Progress, Tally};
 use crate::simulator::recorder::expert_drive::drive_expert;
+use crate::simulator::recorder::foreign_car;
 use crate::simulator::recorder::options::{RecordOptions, RecordingInfo};
 use crate::simulator::recorder::sample::Sample;
 use crate::simulator::recorder::writer::{LogLines, Photographer};
@@ -70,16 +71,26 @@ fn fill(
     let variant = Variant::new(world, options.seed);
     let tally = Tally::new(samples.len(), observer);
     samples.par_iter().try_for_each_init(Photographer::default, |photographer, sample| {
-        photographer.take(world, &variant, sample, &images)?;
+        photographer.take(world, &variant, options.car.as_ref(), sample, &images)?;
         tally.add(1)
     })?;
     let log = folder.unfinished().join("driving_log.csv");
     let lines = LogLines::new(options.format, out)?;
     let mut text = lines.header().as_bytes().to_vec();
-    let rows = samples.iter().try_for_each(|sample| lines.row(sample, &mut text));
+    let rows = samples.iter().try_for_each(|sample| match &options.car {
+        Some(car) => {
+            let steering = foreign_car::steering(sample.steering, car);
+            lines.row(&Sample { steering, ..sample.clone() }, &mut text)
+        }
+        None => lines.row(sample, &mut text),
+    });
     rows.and_then(|()| fs::write(&log, text)).map_err(Error::io(&log))?;
     let description = folder.unfinished().join(DESCRIPTION_FILE);
-    fs::write(&description, "[camera]\npreset = \"steersman\"\n").map_err(Error::io(&description))?;
+    let camera = match &options.car {
+        Some(car) => Description { camera: Some(car.into()), ..Description::default() }.to_toml()?,
+        None => "[camera]\npreset = \"steersman\"\n".into(),
+    };
+    fs::write(&description, camera).map_err(Error::io(&description))?;
     let info = RecordingInfo::new(track, options, samples.len());
     info.write(folder.unfinished())?;
     Ok(info)

@@ -5,9 +5,11 @@ use std::io::{self, Seek as _, SeekFrom, Write as _};
 use std::path::{Path, PathBuf};
 
 use crate::dataset::udacity_writer::{HEADER, picture_name, write_row};
+use crate::geometry::CarGeometry;
 use crate::simulator::camera::jpeg;
 use crate::simulator::camera::pinhole::{Camera, Mount, RgbFrame};
 use crate::simulator::camera::renderer::Renderer;
+use crate::simulator::recorder::foreign_car;
 use crate::simulator::recorder::options::LogFormat;
 use crate::simulator::recorder::sample::Sample;
 use crate::simulator::scenery::light::Variant;
@@ -24,10 +26,21 @@ pub(crate) struct Photographer {
 }
 
 impl Photographer {
-    /// Writes the pictures of all cameras into the folder `images`.
-    pub fn take(&mut self, world: &World, variant: &Variant, sample: &Sample, images: &Path) -> Result<()> {
+    /// Writes the pictures of all cameras, those of `car` if there is one, into the folder `images`.
+    pub fn take(
+        &mut self,
+        world: &World,
+        variant: &Variant,
+        car: Option<&CarGeometry>,
+        sample: &Sample,
+        images: &Path,
+    ) -> Result<()> {
         for mount in Mount::ALL {
-            self.renderer.render(world, variant, &Camera::new(&sample.body, mount), mount, &mut self.frame);
+            let camera = match car {
+                Some(car) => foreign_car::camera(&sample.body, mount, car),
+                None => Camera::new(&sample.body, mount),
+            };
+            self.renderer.render(world, variant, &camera, mount, &mut self.frame);
             self.bytes.clear();
             jpeg::encode(&self.frame, &mut self.bytes)?;
             let path = images.join(image_name(mount, sample.time_s));
@@ -133,7 +146,7 @@ impl<'a> RowWriter<'a> {
     /// # Errors
     /// If something cannot be written. The rows before stay whole.
     pub fn write(&mut self, sample: &Sample) -> Result<()> {
-        self.photographer.take(self.world, &self.variant, sample, &self.images)?;
+        self.photographer.take(self.world, &self.variant, None, sample, &self.images)?;
         self.text.clear();
         let written = self.lines.row(sample, &mut self.text).and_then(|()| self.file.write_all(&self.text));
         if let Err(source) = written {

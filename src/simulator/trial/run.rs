@@ -7,7 +7,7 @@ use crate::observer::Observer;
 use crate::simulator::camera::front_camera::FrontCamera;
 use crate::simulator::camera::pinhole::RgbFrame;
 use crate::simulator::car::expert;
-use crate::simulator::car::speed::{SpeedController, telemetry_mph};
+use crate::simulator::car::speed::{Speed, SpeedController, telemetry_mph};
 use crate::simulator::track::Track;
 use crate::simulator::trial::closed_loop::ClosedLoop;
 use crate::simulator::trial::driver::{DriveState, Driver};
@@ -59,11 +59,14 @@ fn drive_run(
                 None => &blank,
             };
             let asked = Instant::now();
-            let steering = driver.steer(picture, &DriveState { simulation, speed_mph });
+            let answer = driver.drive(picture, &DriveState { simulation, speed_mph });
             let answered_in = asked.elapsed();
-            let target_mph = options.speed.target_mph(simulation);
-            let throttle = controller.throttle_at(simulation.time_s(), target_mph, speed_mph);
-            closed_loop.answer(steering, throttle);
+            let (time_s, target_mph) = (simulation.time_s(), options.speed.target_mph(simulation));
+            let throttle = match (options.speed, answer.pace) {
+                (Speed::Driver(_), Some(pace)) => controller.throttle_for(pace, time_s, target_mph, speed_mph),
+                _ => controller.throttle_at(time_s, target_mph, speed_mph),
+            };
+            closed_loop.answer(answer.steering, throttle);
             if let (Some(observer), Some(moment)) = (&mut observer, closed_loop.last_moment()) {
                 let simulation = closed_loop.simulation();
                 let frame = DriveFrame {
@@ -89,7 +92,6 @@ fn drive_run(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::simulator::car::speed::Speed;
     use crate::simulator::trial::driver::{Expert, Zero};
 
     fn options(assisted: bool) -> TrialOptions {

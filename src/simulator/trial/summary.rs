@@ -40,7 +40,7 @@ impl DriveOptions {
         if self.laps == 0 || self.runs == 0 {
             return fail("laps and runs must be at least 1".to_string());
         }
-        if let Speed::Fixed(mph) = self.speed
+        if let Speed::Fixed(mph) | Speed::Driver(mph) = self.speed
             && !(3.0..=30.0).contains(&mph)
         {
             return fail(format!("speed {mph} mph: 3 to 30 mph can be driven, or `auto`"));

@@ -6,22 +6,32 @@ use crate::dataset::samples::{Correction, Mirror};
 use crate::geometry::{CarGeometry, Offset, PixelGrid, ViewWarp};
 
 impl Loader {
-    /// Writes a sample's network input to `x` and returns its label; `None` if the image cannot be decoded.
-    pub(super) fn make_sample(&self, wanted: &Wanted, x: &mut [f32], scratch: &mut Scratch) -> Result<Option<f32>> {
+    /// Writes a sample's network input to `x` and its labels to `labels`; `false` if the image cannot be decoded.
+    pub(super) fn make_sample(
+        &self,
+        wanted: &Wanted,
+        x: &mut [f32],
+        labels: &mut [f32],
+        scratch: &mut Scratch,
+    ) -> Result<bool> {
         let own = wanted.sample / self.variants() as u32;
         let (number, camera) = self.images[own as usize];
         let item = self.items[number as usize];
         let mirrored = self.is_mirrored(wanted.draws);
         // The second augmentation of a sample has numbers that no first one has.
-        let stream = u64::from(wanted.draws) + if wanted.again { self.samples() as u64 } else { 0 };
+        let samples = self.images.len() * self.variants();
+        let stream = u64::from(wanted.draws) + if wanted.again { samples as u64 } else { 0 };
         let in_mirrored_world = mirrored && self.spec.samples.mirror == Mirror::Geometry;
         let view = self.view(stream);
         let image = view.map_or(own, |offset| self.nearest_image(number, offset));
         let Scratch { file, image: decoded, preprocessor, cached, rgb, planes } = scratch;
-        let made = self.cache.get(image as usize, cached, |out| {
-            self.decode(image, file, decoded, preprocessor, out).map_err(|message| self.report(image, message)).is_ok()
+        let picture = self.pictures[image as usize];
+        let made = self.cache.get(picture as usize, cached, |out| {
+            self.decode(image, file, decoded, preprocessor, out)
+                .map_err(|message| self.report(picture, message))
+                .is_ok()
         })?;
-        let Some(made) = made else { return Ok(None) };
+        let Some(made) = made else { return Ok(false) };
         let preprocessing = &self.spec.preprocessing;
         let mut moved_px = 0.0;
         let keeps_rgb = keeps_rgb(&self.spec, self.training, self.flip);
@@ -51,7 +61,9 @@ impl Loader {
             }
             preprocessing.to_input(planes, x);
         });
-        Ok(Some(if mirrored { -label } else { label }))
+        labels[0] = if mirrored { -label } else { label };
+        labels[1..].copy_from_slice(self.targets.labels_beside_steering(item));
+        Ok(true)
     }
 
     /// Where beside the driven path a sample with the random numbers `stream` is shown from; `None` as it was taken.
@@ -122,24 +134,19 @@ impl Loader {
         preprocessor: &mut Preprocessor,
         out: &mut [u8],
     ) -> std::result::Result<(), String> {
-        let (item, camera) = self.images[image as usize];
-        let Item { recording, row, .. } = self.items[item as usize];
-        let path = self.recordings[usize::from(recording)].image_path(row as usize, camera).ok_or("no such image")?;
-        let failed = |message: String| format!("{}: {message}", path.display());
-        self.times.decode.time(|| {
-            self.recordings[usize::from(recording)]
-                .read_picture(row as usize, camera, file)
-                .map_err(|error| error.to_string())?;
-            decode_rgb(file, decoded).map_err(failed)
-        })?;
+        let (_, camera) = self.images[image as usize];
+        self.times.decode.time(|| self.read(image, file, decoded))?;
+        let failed = |message: String| {
+            let Item { recording, row, .. } = self.items[self.images[image as usize].0 as usize];
+            let path = self.recordings[usize::from(recording)].image_path(row as usize, camera);
+            format!("{}: {message}", path.unwrap_or_default().display())
+        };
         if preprocessor.image_size() != [decoded.height, decoded.width] {
             let planned = self.spec.preprocessing.plan(decoded.height, decoded.width);
             *preprocessor = planned.map_err(|error| failed(error.to_string()))?;
         }
-        if camera == View::Centre {
-            let Preprocessing { rows, source, .. } = self.spec.preprocessing;
-            self.thumbnails[item as usize].get_or_init(|| Thumbnail::of(decoded, rows, source[0]));
-        }
+        self.thumbnails[self.pictures[image as usize] as usize]
+            .get_or_init(|| (camera == View::Centre).then(|| self.thumbnail(decoded)));
         self.times.preprocess.time(|| {
             if keeps_rgb(&self.spec, self.training, self.flip) {
                 preprocessor.to_rgb_stage(&decoded.pixels, out);
@@ -148,5 +155,38 @@ impl Loader {
             }
         });
         Ok(())
+    }
+
+    /// Reads and decodes an image.
+    fn read(&self, image: u32, file: &mut Vec<u8>, decoded: &mut RgbImage) -> std::result::Result<(), String> {
+        let (item, camera) = self.images[image as usize];
+        let Item { recording, row, .. } = self.items[item as usize];
+        let recording = &self.recordings[usize::from(recording)];
+        let path = recording.image_path(row as usize, camera).ok_or("no such image")?;
+        recording.read_picture(row as usize, camera, file).map_err(|error| error.to_string())?;
+        decode_rgb(file, decoded).map_err(|message| format!("{}: {message}", path.display()))
+    }
+
+    fn thumbnail(&self, decoded: &RgbImage) -> Thumbnail {
+        let Preprocessing { rows, source, .. } = self.spec.preprocessing;
+        Thumbnail::of(decoded, rows, source[0])
+    }
+
+    /// Looks at the centre pictures of rows of which only other pictures were shown: a view from beside the path is made of the nearest
+    /// camera's.
+    pub(super) fn look_at_centres(&self) {
+        let known = |image: u32| self.thumbnails[self.pictures[image as usize] as usize].get().is_some();
+        (0..self.items.len()).into_par_iter().for_each_init(
+            Default::default,
+            |(file, decoded): &mut (_, RgbImage), item| {
+                let images = self.first_images[item]..self.first_images[item + 1];
+                let centre = images.clone().find(|&image| self.images[image as usize].1 == View::Centre);
+                let Some(centre) = centre.filter(|&centre| !known(centre) && images.clone().any(known)) else { return };
+                // Pictures that cannot be read are told where they are trained on.
+                if self.read(centre, file, decoded).is_ok() {
+                    let _ = self.thumbnails[self.pictures[centre as usize] as usize].set(Some(self.thumbnail(decoded)));
+                }
+            },
+        );
     }
 }

@@ -1,0 +1,111 @@
+//! `train RECORDING --with-simulator`: the simulator's set, as the camera of a recording sees it.
+
+use std::path::{Path, PathBuf};
+
+use super::job::{JobEvent, training_set};
+use super::training_set::Take;
+use crate::dataset::{self, Description, ImageCheck};
+use crate::error::{Error, Result};
+use crate::geometry::CarGeometry;
+use crate::observer::{Observer, StopSignal};
+use crate::simulator::recorder::foreign_car;
+
+/// The recordings of `takes` under `folder` with camera and car of `recordings`, of which the user says `said`; recorded now if they
+/// are not there.
+///
+/// # Errors
+///
+/// [`Error::Usage`] if the recordings have different cameras, or one that the simulator cannot have; as [`training_set`] and
+/// [`dataset::load_with`].
+pub fn simulator_set(
+    folder: &Path,
+    takes: &[Take],
+    recordings: &[PathBuf],
+    said: &Description,
+    observer: &mut (dyn Observer<JobEvent> + Send),
+    stop: &StopSignal,
+) -> Result<Vec<PathBuf>> {
+    let car = car_of(recordings, said)?;
+    let own = car.as_ref().is_none_or(|car| *car == CarGeometry::simulator());
+    training_set(folder, takes, car.as_ref().filter(|_| !own), observer, stop)
+}
+
+/// Camera and car of `recordings`; `None` if there are none.
+fn car_of(recordings: &[PathBuf], said: &Description) -> Result<Option<CarGeometry>> {
+    let mut first: Option<(&PathBuf, CarGeometry)> = None;
+    for path in recordings {
+        let car = dataset::load_with(path, said, ImageCheck::Skip)?.geometry;
+        if let Some(trouble) = foreign_car::trouble(&car) {
+            let message =
+                format!("{}: --with-simulator cannot show its set as this camera sees: {trouble}", path.display());
+            return Err(Error::Usage(message));
+        }
+        match &first {
+            Some((other, known)) if *known != car => {
+                let [other, path] = [other, path].map(|path| path.display());
+                let message = "have different cameras or cars (steersman.toml), and --with-simulator can have only one";
+                return Err(Error::Usage(format!("{other} and {path} {message}")));
+            }
+            Some(_) => {}
+            None => first = Some((path, car)),
+        }
+    }
+    Ok(first.map(|(_, car)| car))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::dataset::testing::jpeg;
+    use crate::observer::Unobserved;
+
+    fn recording(folder: &Path, name: &str, camera: &str) -> PathBuf {
+        let path = folder.join(name);
+        std::fs::create_dir_all(path.join("IMG")).unwrap();
+        std::fs::write(path.join("IMG/a.jpg"), jpeg(32, 16, [9, 9, 9])).unwrap();
+        std::fs::write(path.join("driving_log.csv"), "IMG/a.jpg,,,0.1,1,0,20\n".repeat(3)).unwrap();
+        std::fs::write(path.join("steersman.toml"), format!("[camera]\n{camera}\n")).unwrap();
+        path
+    }
+
+    #[test]
+    fn the_set_is_recorded_with_the_recordings_camera_and_by_itself_for_the_simulators() {
+        let scratch = tempfile::tempdir().unwrap();
+        let folder = scratch.path();
+        let takes = [Take { track: "lake".into(), laps: 0.01, reverse: false, recovery: false, seed: 3 }];
+        let set = |recordings: &[PathBuf]| {
+            let sets = folder.join("sets");
+            simulator_set(&sets, &takes, recordings, &Description::default(), &mut Unobserved, &StopSignal::default())
+        };
+        let own = set(&[recording(folder, "own", "preset = \"steersman\"")]).unwrap();
+        assert_eq!(
+            own,
+            training_set(&folder.join("sets"), &takes, None, &mut Unobserved, &StopSignal::default()).unwrap()
+        );
+        let udacity = recording(folder, "udacity", "preset = \"udacity\"\nfull_lock_deg = 20.0");
+        let other = set(std::slice::from_ref(&udacity)).unwrap();
+        assert_ne!(own, other);
+        let [own, other] = [&own, &other].map(|set| dataset::load(&set[0]).unwrap());
+        assert_eq!(other.geometry, dataset::load(&udacity).unwrap().geometry);
+        assert!(other.camera_named && own.rows.len() == other.rows.len());
+        // The same bends, in shares of a smaller lock, and another view of the same place.
+        let turns = own.rows.iter().zip(&other.rows).filter(|(row, _)| row.steering.abs() > 0.02);
+        assert!(turns.clone().count() > 0);
+        turns.for_each(|(row, as_other)| assert!((as_other.steering / row.steering - 1.25).abs() < 1e-3));
+        let [picture, as_other] =
+            [&own, &other].map(|of| std::fs::read(of.image_path(0, dataset::View::Centre).unwrap()).unwrap());
+        assert!(picture != as_other);
+    }
+
+    #[test]
+    fn different_cameras_and_small_cars_are_refused() {
+        let scratch = tempfile::tempdir().unwrap();
+        let folder = scratch.path();
+        let [a, b, c] = [("a", "udacity"), ("b", "steersman"), ("c", "donkeycar")]
+            .map(|(name, preset)| recording(folder, name, &format!("preset = \"{preset}\"")));
+        let refused = |recordings: &[PathBuf]| car_of(recordings, &Description::default()).unwrap_err().to_string();
+        assert!(refused(&[a.clone(), b]).contains("different cameras"));
+        assert!(refused(&[c]).contains("its lens is another one"));
+        assert_eq!(car_of(&[a.clone(), a], &Description::default()).unwrap(), CarGeometry::preset("udacity"));
+    }
+}
