@@ -165,6 +165,8 @@
     allow(dead_code, unused_imports, reason = "the smaller feature sets use a part of what the rooms share")
 )]
 
+#[cfg(feature = "training")]
+pub mod calm;
 #[cfg(feature = "cli")]
 pub mod cli;
 #[cfg(feature = "live")]

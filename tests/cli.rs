@@ -262,7 +262,7 @@ fn bench_prints_every_figure() {
 #[test]
 fn a_sweep_of_latencies_says_where_a_driver_breaks_and_saves_table_chart_and_drives() {
     let folder = tempfile::tempdir().unwrap();
-    let sweep = ["drive", "expert", "--track", "lake", "--runs", "1", "--latency-ms", "0,2000", "--against", "zero"];
+    let sweep = ["drive", "expert", "--track", "lake", "--runs", "1", "--latency-ms", "2000,0", "--against", "zero"];
     let result = json(folder.path(), &[&sweep[..], &["--out", "sweep", "--json"]].concat());
     assert_eq!(
         (&result["driver"], &result["swept"], number(&result, "breaks_at")),
@@ -286,6 +286,8 @@ fn a_sweep_of_latencies_says_where_a_driver_breaks_and_saves_table_chart_and_dri
         (&["--latency-ms", "0,50", "--noise", "0,0.1"][..], "not of both"),
         (&["--noise", "0,0.1", "--watch"][..], "give one"),
         (&["--latency-ms", "0,3000"][..], "3000"),
+        (&["--latency-ms", "0,50,0"][..], "0 ms is named twice"),
+        (&["--noise", "0.1,2"][..], "noise 2"),
     ] {
         let refused = common::command::error(folder.path(), &[&sweep[..6], arguments].concat());
         assert!(refused.contains(message), "{refused}");

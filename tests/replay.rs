@@ -46,6 +46,23 @@ fn who_pursues_the_path_stays_on_it_and_who_does_not_is_put_back() {
     let zero = drive(&log, 0.0, |_| 0.0);
     let summary = summarise(&zero, 1.0);
     assert!(summary.interventions >= 3 && summary.whiteness_deg_s == 0.0, "{summary:?}");
+    let calm = summary.calm.unwrap();
+    assert_eq!((calm.reversals_per_min, calm.angle_change_p95_deg), (0.0, 0.0), "a wheel held straight");
+    assert!(calm.lateral_jerk_rms_mps3 < 1e-9, "{calm:?}");
+    // A wheel that moves by 2 deg to and fro at every frame turns back 20 times a second.
+    let mut right = false;
+    let shaking = std::sync::Mutex::new(&mut right);
+    let shaken = summarise(
+        &drive(&log, 0.0, |pursuit| {
+            let mut right = shaking.lock().unwrap();
+            **right = !**right;
+            pursuit as f32 + if **right { 0.04 } else { -0.04 }
+        }),
+        1.0,
+    );
+    let calm = shaken.calm.unwrap();
+    assert!((1000.0..=1200.0).contains(&calm.reversals_per_min), "{calm:?}");
+    assert!((1.9..3.0).contains(&calm.angle_change_p95_deg), "{calm:?}");
     let charged = 6.0 * summary.interventions as f64;
     assert!((summary.autonomy_percent - (100.0 * (1.0 - charged / summary.time_s)).max(0.0)).abs() < 1e-9);
     // The moment after each intervention the car is on the path again.
@@ -171,6 +188,23 @@ fn the_command_tells_writes_and_refuses() {
     let told = run(dir, &["drive", "zero", "--on", "drive"]).stderr;
     assert!(String::from_utf8(told).unwrap().contains("`udacity` is assumed"));
     assert!(said(&["drive", "zero", "--on", "drive", "--latency-ms=-1"]).contains("latency"));
+    assert!(said(&["drive", "zero", "--on", "drive", "--noise", "0.1"]).contains("leave it out"));
+    assert!(said(&["drive", "zero", "--on", "drive", "--latency-ms", "0,3000"]).contains("3000"));
+    assert!(said(&["drive", "zero", "--on", "drive", "--latency-ms", "0,50,0"]).contains("named twice"));
+
+    // Several latencies are driven from the smallest to the largest, each as it would be alone.
+    let swept = json(dir, &["drive", "zero", "--on", "drive", "--latency-ms", "200,0", "--json"]);
+    let points = swept["points"].as_array().unwrap();
+    let latencies: Vec<f64> = points.iter().map(|point| point["latency_ms"].as_f64().unwrap()).collect();
+    assert_eq!(latencies, [0.0, 200.0]);
+    let alone = json(dir, &["drive", "zero", "--on", "drive", "--latency-ms", "200", "--json"]);
+    for key in ["interventions", "offset_mean_m", "whiteness_deg_s", "calm"] {
+        assert_eq!(points[1][key], alone[key], "{key}");
+    }
+    assert!(alone["calm"]["reversals_per_min"].is_number(), "{alone}");
+    let told = run(dir, &["drive", "zero", "--on", "drive", "--latency-ms", "0,200"]).stdout;
+    let table = String::from_utf8(told).unwrap();
+    assert!(table.contains("200 ms") && table.contains("reversals"), "{table}");
 
     // What was driven is told, whatever cannot be written; the command fails all the same.
     let nowhere = ["drive", "zero", "--on", "drive", "--video", "drive/driving_log.csv/film.mp4"];

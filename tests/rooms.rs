@@ -5,13 +5,14 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 /// The top-level rooms. A room may use those above it.
-const ROOMS: [&str; 29] = [
+const ROOMS: [&str; 30] = [
     "error",
     "suggestion",
     "text",
     "observer",
     "metrics",
     "statistics",
+    "calm",
     "picture",
     "geometry",
     "files",

@@ -120,9 +120,16 @@ pub fn run(args: DriveArgs) -> Result<()> {
             return Err(Error::Usage("several values of --latency-ms or of --noise are driven, not of both".into()));
         }
     };
-    if swept.is_some() && (args.on.is_some() || args.watch || args.video.is_some()) {
-        let message = "several values of --latency-ms or --noise do not go with --on, --watch or --video: give one";
+    if swept.is_some() && (args.watch || args.video.is_some()) {
+        let message = "several values of --latency-ms or --noise do not go with --watch or --video: give one";
         return Err(Error::Usage(message.into()));
+    }
+    if args.on.is_some() && swept.is_some() && (args.out.is_some() || args.against.is_some()) {
+        let message = "several values of --latency-ms with --on do not go with --out or --against: give one";
+        return Err(Error::Usage(message.into()));
+    }
+    if args.on.is_some() && args.noise != [0.0] {
+        return Err(Error::Usage("--noise disturbs the steering on a track, not on a recording: leave it out".into()));
     }
     let track = match (&args.on, &args.track) {
         (None, Some(track)) => Track::load(track)?,
@@ -139,7 +146,7 @@ pub fn run(args: DriveArgs) -> Result<()> {
                 saliency: args.saliency,
                 fps: args.fps,
                 camera: args.camera.as_deref(),
-                latency_ms,
+                latencies_ms: &args.latency_ms,
                 threads: args.threads,
                 json: args.json,
             });
@@ -173,8 +180,9 @@ pub fn run(args: DriveArgs) -> Result<()> {
         let DriveSummary { laps_completed, laps_total, autonomy_percent, cte_mean_m, .. } = &result.summary;
         live.finish(&format!(
             "The drive of {} is over: {laps_completed} of {laps_total} laps completed, autonomy {autonomy_percent:.1} %, on average \
-             {cte_mean_m:.2} m off the middle.",
-            args.model
+             {cte_mean_m:.2} m off the middle.{}",
+            args.model,
+            calm_words(&result.summary)
         ));
     }
     let comparison = other.as_ref().map_or(Ok(Vec::new()), |other| compare(&result, other))?;
@@ -370,6 +378,15 @@ fn summary_text(model: &str, s: &DriveSummary) -> String {
         s.expert_whiteness_deg_s,
         calm_text(s),
         s.realtime_factor
+    )
+}
+
+/// How calm the wheel was, in a sentence.
+fn calm_words(s: &DriveSummary) -> String {
+    let (Some(calm), Some(expert)) = (&s.calm, &s.expert_calm) else { return String::new() };
+    format!(
+        " The wheel turned back {:.1} times a minute (the expert's {:.1}), and its whiteness was {:.1} deg/s ({:.1}).",
+        calm.reversals_per_min, expert.reversals_per_min, s.whiteness_deg_s, s.expert_whiteness_deg_s
     )
 }
 

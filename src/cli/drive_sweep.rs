@@ -35,6 +35,7 @@ impl<'a> Report<'a> {
 
 /// Drives at each of the `values` of what is swept; `options` say the rest.
 pub fn run(args: &DriveArgs, track: &Track, options: &DriveOptions, swept: Swept, values: &[f64]) -> Result<()> {
+    let drives = drives(options, swept, values)?;
     let drivers: Vec<&str> = std::iter::once(args.model.as_str()).chain(args.against.as_deref()).collect();
     let wheels = drivers.iter().map(|name| args.wheel(name)).collect::<Result<Vec<Wheel>>>()?;
     // What cannot be created is told before minutes are spent.
@@ -44,13 +45,10 @@ pub fn run(args: &DriveArgs, track: &Track, options: &DriveOptions, swept: Swept
     let mut sweeps = Vec::new();
     for (number, (wheel, driver)) in wheels.iter().zip(&drivers).enumerate() {
         let mut points = Vec::new();
-        for &value in values {
-            let options = match swept {
-                Swept::LatencyMs => DriveOptions { latency_ms: value, ..options.clone() },
-                Swept::Noise => DriveOptions { noise: value, ..options.clone() },
-            };
+        for (value, options) in &drives {
+            let value = *value;
             let name = format!("{driver}, {}", swept.value(value));
-            let result = pool.install(|| wheel.drive(track, &options, &name, None, &stop))?;
+            let result = pool.install(|| wheel.drive(track, options, &name, None, &stop))?;
             if let Some(folder) = &folder {
                 let name = format!("{}{}", if number == 0 { "" } else { "against-" }, swept.value(value));
                 let of_value = NewFolder::create(&folder.unfinished().join(name.replace(' ', "-")))?;
@@ -70,6 +68,34 @@ pub fn run(args: &DriveArgs, track: &Track, options: &DriveOptions, swept: Swept
     saved
 }
 
+/// The drives of a sweep, each with its value, from the smallest value to the largest.
+///
+/// # Errors
+/// [`Error::Usage`] for a value that cannot be driven, and for one that is named twice.
+fn drives(options: &DriveOptions, swept: Swept, values: &[f64]) -> Result<Vec<(f64, DriveOptions)>> {
+    let of_value = |&value: &f64| {
+        let options = match swept {
+            Swept::LatencyMs => DriveOptions { latency_ms: value, ..options.clone() },
+            Swept::Noise => DriveOptions { noise: value, ..options.clone() },
+        };
+        options.check().map(|()| (value, options))
+    };
+    ascending(swept, values)?.iter().map(of_value).collect()
+}
+
+/// `values` from the smallest to the largest.
+///
+/// # Errors
+/// [`Error::Usage`] for one that is named twice.
+pub(super) fn ascending(swept: Swept, values: &[f64]) -> Result<Vec<f64>> {
+    let mut values = values.to_vec();
+    values.sort_by(f64::total_cmp);
+    match values.windows(2).find(|pair| pair[0] == pair[1]) {
+        Some(pair) => Err(Error::Usage(format!("{} is named twice: name each value once", swept.value(pair[0])))),
+        None => Ok(values),
+    }
+}
+
 /// Writes `sweep.csv` and `sweep.html`, and gives the folder its name.
 fn save(track: &Track, sweeps: &[Sweep], folder: NewFolder) -> Result<()> {
     let write = |name: &str, bytes: &[u8]| {
@@ -85,12 +111,16 @@ fn save(track: &Track, sweeps: &[Sweep], folder: NewFolder) -> Result<()> {
 fn table(track: &Track, runs: usize, sweep: &Sweep) -> String {
     let mut rows: Vec<Vec<String>> = vec![COLUMNS.iter().map(|(header, _)| header.to_string()).collect()];
     rows.extend(sweep.points.iter().map(|point| COLUMNS.iter().map(|(_, cell)| cell(sweep.swept, point)).collect()));
+    format!("{} on {}, {runs} runs each\n{}{}\n", sweep.driver, track.name(), aligned(&rows), sweep.verdict())
+}
+
+/// `rows` as lines whose columns end below each other; all rows have as many cells as the first.
+pub(super) fn aligned(rows: &[Vec<String>]) -> String {
     let width = |column: usize| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
-    let widths: Vec<usize> = (0..COLUMNS.len()).map(width).collect();
+    let widths: Vec<usize> = (0..rows.first().map_or(0, Vec::len)).map(width).collect();
     let line = |row: &Vec<String>| {
         let cells: Vec<String> = row.iter().zip(&widths).map(|(cell, width)| format!("{cell:>width$}")).collect();
         cells.join("  ") + "\n"
     };
-    let rows: String = rows.iter().map(line).collect();
-    format!("{} on {}, {runs} runs each\n{rows}{}\n", sweep.driver, track.name(), sweep.verdict())
+    rows.iter().map(line).collect()
 }

@@ -7,11 +7,13 @@ use std::time::Instant;
 
 use serde::Serialize;
 
+use super::drive_sweep::{aligned, ascending};
 use super::model_arg::model_file;
 use super::recording_args::RecordingArgs;
 use super::share_bar::ShareBar;
 use super::video::tell_video;
 use super::{end_with, load_pilot, pool, print, print_json, refuse_existing, stop_on_ctrl_c};
+use crate::calm::Calm;
 use crate::error::{Error, Result};
 use crate::files::new_folder::NewFolder;
 use crate::geometry::GeometryEntry;
@@ -23,6 +25,7 @@ use crate::replay::{
     ReplayFrame, ReplayLog, ReplayOptions, ReplayRun, ReplaySummary, WarpCheck, replay, side_camera_check, summarise,
 };
 use crate::report;
+use crate::report::pages::sweep::Swept;
 use crate::report::video::on_recording::ReplayVideo;
 use crate::report::video::onlooker::Onlooker;
 
@@ -48,8 +51,8 @@ pub struct ReplayArgs<'a> {
     pub fps: Option<f64>,
     /// Name of a camera preset.
     pub camera: Option<&'a str>,
-    /// Time from a picture to the wheels, ms.
-    pub latency_ms: f64,
+    /// Times from a picture to the wheels, ms; several are driven one after the other.
+    pub latencies_ms: &'a [f64],
     /// Threads; 0 is one for each core.
     pub threads: usize,
     /// Print JSON.
@@ -89,7 +92,11 @@ pub fn run(args: &ReplayArgs) -> Result<()> {
         }
     };
     let log = ReplayLog::new(&recording, geometry)?;
-    let options = ReplayOptions { latency_ms: args.latency_ms, ..ReplayOptions::usual(&log.geometry) };
+    if args.latencies_ms.len() > 1 {
+        return sweep(args, &log, &pool);
+    }
+    let latency_ms = args.latencies_ms.first().copied().unwrap_or_default();
+    let options = ReplayOptions { latency_ms, ..ReplayOptions::usual(&log.geometry) };
     let at_wheel = Wheel::find(args.model)?;
     let other = args.against.map(|name| Wheel::find(name).map(|wheel| (name, wheel))).transpose()?;
     if let Some(video) = args.video {
@@ -158,6 +165,58 @@ pub fn run(args: &ReplayArgs) -> Result<()> {
     text += &warp.map_or_else(unchecked, warp_text);
     print(&text)?;
     end_with(failed)
+}
+
+/// A drive at one latency of several; what `--json` prints of it.
+#[derive(Serialize)]
+struct AtLatency {
+    latency_ms: f64,
+    #[serde(flatten)]
+    summary: ReplaySummary,
+}
+
+/// What `drive --on RECORDING --latency-ms A,B,… --json` prints.
+#[derive(Serialize)]
+struct SweepReport<'a> {
+    recording: &'a Path,
+    driver: &'a str,
+    points: &'a [AtLatency],
+}
+
+/// Drives at each of several latencies, from the smallest to the largest.
+fn sweep(args: &ReplayArgs, log: &ReplayLog, pool: &rayon::ThreadPool) -> Result<()> {
+    let all = ascending(Swept::LatencyMs, args.latencies_ms)?.into_iter();
+    let all: Vec<_> =
+        all.map(|latency_ms| ReplayOptions { latency_ms, ..ReplayOptions::usual(&log.geometry) }).collect();
+    all.iter().try_for_each(ReplayOptions::check)?;
+    let (wheel, stop) = (Wheel::find(args.model)?, stop_on_ctrl_c()?);
+    let mut points = Vec::new();
+    for options in all {
+        let began = Instant::now();
+        let drive = Drive { log, options: &options, stop: &stop };
+        let runs = pool.install(|| drive.go(&wheel, &format!("{}, {} ms", args.model, options.latency_ms)))?;
+        let summary = summarise(&runs, began.elapsed().as_secs_f64());
+        points.push(AtLatency { latency_ms: options.latency_ms, summary });
+    }
+    if args.json {
+        return print_json(&SweepReport { recording: args.on, driver: args.model, points: &points });
+    }
+    let headers = ["at", "autonomy", "put back", "off the path", "95 % below", "whiteness", "reversals", "jerk"];
+    let mut rows = vec![headers.map(String::from).to_vec()];
+    rows.extend(points.iter().map(|AtLatency { latency_ms, summary: s }| {
+        let calm = s.calm.unwrap_or_default();
+        vec![
+            format!("{latency_ms} ms"),
+            format!("{:.1} %", s.autonomy_percent),
+            s.interventions.to_string(),
+            format!("{:.2} m", s.offset_mean_m),
+            format!("{:.2} m", s.offset_p95_m),
+            format!("{:.1} deg/s", s.whiteness_deg_s),
+            format!("{:.1}/min", calm.reversals_per_min),
+            format!("{:.1} m/s³", calm.lateral_jerk_rms_mps3),
+        ]
+    }));
+    print(&format!("{} on the recording\n{}", args.model, aligned(&rows)))
 }
 
 /// Who steers: a model, or nobody.
@@ -261,7 +320,7 @@ fn summary_text(model: &str, s: &ReplaySummary) -> String {
          interventions              {} ({:.2} a km)\n\
          distance driven            {:.0} m in {:.0} s\n\
          off the path mean/RMS/p95  {:.2} / {:.2} / {:.2} m\n\
-         whiteness                  {:.1} deg/s\n\
+         whiteness                  {:.1} deg/s\n{}\
          frames                     {} ({:.0} a second)\n",
         s.autonomy_percent,
         s.interventions,
@@ -272,8 +331,19 @@ fn summary_text(model: &str, s: &ReplaySummary) -> String {
         s.offset_rms_m,
         s.offset_p95_m,
         s.whiteness_deg_s,
+        s.calm.map_or(String::new(), calm_text),
         s.frames,
         s.frames_per_second
+    )
+}
+
+/// The measures of calm, a line each.
+fn calm_text(calm: Calm) -> String {
+    format!(
+        "wheel reversals            {:.1} a minute\n\
+         angle's change, 95 %       {:.2} deg a frame\n\
+         lateral jerk, RMS          {:.1} m/s³\n",
+        calm.reversals_per_min, calm.angle_change_p95_deg, calm.lateral_jerk_rms_mps3
     )
 }
 

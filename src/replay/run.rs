@@ -4,6 +4,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::log::{Frames, ReplayLog};
+use crate::calm::{Calm, CalmFrame};
 use crate::dataset::{DrivenSession, View};
 use crate::error::{Error, Result};
 use crate::geometry::{CarGeometry, LookAhead, Offset, PixelGrid, ViewWarp};
@@ -35,6 +36,18 @@ impl ReplayOptions {
     /// No latency, the usual look-ahead, and every picture can be read.
     pub fn usual(geometry: &CarGeometry) -> ReplayOptions {
         ReplayOptions { latency_ms: 0.0, look_ahead: LookAhead::usual(geometry), leave_out_unreadable: false }
+    }
+
+    /// Checks that it can be driven.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Usage`] with what is possible.
+    pub fn check(&self) -> Result<()> {
+        if !(0.0..=2000.0).contains(&self.latency_ms) {
+            return Err(Error::Usage(format!("latency {} ms: 0 to 2000 ms can be simulated", self.latency_ms)));
+        }
+        Ok(())
     }
 }
 
@@ -83,6 +96,8 @@ pub struct ReplayFrame<'a> {
 pub struct ReplayRun {
     /// Moments at 20 Hz.
     pub moments: Vec<ReplayMoment>,
+    /// Angle of the front wheels at steering 1, deg.
+    pub full_lock_deg: f64,
     /// Times the car was put back.
     pub interventions: usize,
     /// Way along the path, m.
@@ -99,6 +114,18 @@ impl ReplayRun {
     /// Share of the time in which nobody had to help, %.
     pub fn autonomy_percent(&self) -> f64 {
         autonomy_percent(self.interventions, self.time_s)
+    }
+
+    /// The moments and the time, s, as [`Calm::of`] takes them.
+    fn calm_frames(&self) -> (Vec<CalmFrame>, f64) {
+        let frames = self.moments.iter().map(|moment| CalmFrame {
+            time_s: moment.time_s,
+            angle_deg: moment.steering * self.full_lock_deg,
+            heading_deg: moment.heading_deg,
+            speed_mps: moment.speed_mps,
+            put_back: moment.put_back,
+        });
+        (frames.collect(), self.time_s)
     }
 }
 
@@ -130,6 +157,9 @@ pub struct ReplaySummary {
     pub offset_p95_m: f64,
     /// Root mean square rate of the steering, deg/s.
     pub whiteness_deg_s: f64,
+    /// How calm the drive is; absent where an older version drove.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub calm: Option<Calm>,
     /// Frames shown.
     pub frames: usize,
     /// Frames a second; the one number that differs between runs.
@@ -151,9 +181,7 @@ pub fn replay<D>(
 where
     D: FnMut(&RgbImage) -> Result<f32>,
 {
-    if !(0.0..=2000.0).contains(&options.latency_ms) {
-        return Err(Error::Usage(format!("latency {} ms: 0 to 2000 ms can be simulated", options.latency_ms)));
-    }
+    options.check()?;
     (log.sessions.par_iter().enumerate())
         .map(|(number, session)| drive_session(log, session, options, new_driver()?, &|frame| seen(number, frame)))
         .collect()
@@ -168,7 +196,7 @@ fn drive_session(
 ) -> Result<ReplayRun> {
     let ReplayLog { geometry, .. } = log;
     let path = &session.path;
-    let mut run = ReplayRun::default();
+    let mut run = ReplayRun { full_lock_deg: geometry.full_lock_deg, ..ReplayRun::default() };
     let mut eye = Eye::default();
     let Some(mut pose) = path.pose_at(0.0) else { return Ok(run) };
     let mut at_m = 0.0;
@@ -292,6 +320,7 @@ pub fn summarise(runs: &[ReplayRun], seconds: f64) -> ReplaySummary {
         offset_rms_m: (offsets.iter().map(|m| m * m).sum::<f64>() / n).sqrt(),
         offset_p95_m: p95.copied().unwrap_or(0.0),
         whiteness_deg_s: (whiteness_sum / time_s.max(1e-9)).sqrt(),
+        calm: Some(Calm::of(runs.iter().map(|run| run.calm_frames()))),
         frames: offsets.len(),
         frames_per_second: offsets.len() as f64 / seconds.max(1e-9),
     }

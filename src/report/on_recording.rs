@@ -41,7 +41,7 @@ pub fn drive_summary(log: &ReplayLog, runs: &[ReplayRun], summary: &ReplaySummar
         mean_speed_mph: summary.distance_m / summary.time_s.max(1e-9) * MPH_PER_MPS,
         whiteness_deg_s: summary.whiteness_deg_s,
         expert_whiteness_deg_s: driver_whiteness_deg_s(log),
-        calm: None,
+        calm: summary.calm,
         expert_calm: None,
         realtime_factor: summary.frames_per_second * summary.time_s / summary.frames.max(1) as f64,
     }

@@ -30,7 +30,6 @@ pub use road::line::{Location, Road, Station};
 pub use scenery::light::Variant;
 pub use scenery::world::World;
 pub use track::Track;
-pub use trial::calm::Calm;
 pub use trial::closed_loop::ClosedLoop;
 pub use trial::drive::{compare, drive, drive_observed};
 pub use trial::driver::{DriveState, Driver, DriverAnswer, Expert, Zero};

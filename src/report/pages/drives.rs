@@ -6,13 +6,14 @@ use std::path::Path;
 use serde::Deserialize;
 
 use super::html::Page;
+use crate::calm::Calm;
 use crate::error::Result;
 use crate::report::charts::map::{self, MapPoint};
 use crate::report::tone::Tone;
 use crate::simulator::trial::trajectory::{
     RUN_DEPTH, Waypoint, find_drives, read_summary, read_trajectory, trajectories,
 };
-use crate::simulator::{Calm, DriveSummary, Track};
+use crate::simulator::{DriveSummary, Track};
 
 /// Headers of [`DriveView::row`].
 pub(super) const HEADERS: [&str; 11] = [
@@ -91,10 +92,11 @@ impl DriveView {
     }
 }
 
-/// A measure of the driver with its unit, and that of the expert; a dash where an older version wrote the drive.
+/// A measure of the driver with its unit, and that of the expert, where there is one; a dash where an older version wrote the drive.
 fn beside(summary: &DriveSummary, measure: impl Fn(&Calm) -> String, unit: &str) -> String {
     match (&summary.calm, &summary.expert_calm) {
         (Some(calm), Some(expert)) => format!("{}{unit} ({})", measure(calm), measure(expert)),
+        (Some(calm), None) => format!("{}{unit}", measure(calm)),
         _ => "-".into(),
     }
 }

@@ -41,7 +41,7 @@ impl Swept {
     }
 }
 
-/// The drives of one driver, in the order in which they were asked for.
+/// The drives of one driver, from the smallest value to the largest.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Sweep {
     /// Model, or `expert`.

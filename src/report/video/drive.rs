@@ -6,6 +6,7 @@ use super::film::Video;
 use super::onlooker::Onlooker;
 use super::painter::{Captions, FilmFrame, FilmScales, Painter};
 use super::summary::VideoSummary;
+use crate::calm::Calm;
 use crate::error::{Error, Result};
 use crate::observer::{Observer, Progress};
 use crate::picture::RgbImage;
@@ -130,7 +131,10 @@ fn outcome(run: &Trial, options: &TrialOptions) -> String {
         Some(Failure::StoodStill) => format!("stood still after {time_s:.1} s"),
         None if run.laps_completed < options.laps => format!("too slow: stopped after {time_s:.1} s"),
         None if run.interventions > 0 => format!("{time_s:.1} s, put back {} times", run.interventions),
-        None if options.laps == 1 => format!("lap completed in {time_s:.1} s"),
-        None => format!("{} laps completed in {time_s:.1} s", options.laps),
+        None => {
+            let laps = if options.laps == 1 { "lap".into() } else { format!("{} laps", options.laps) };
+            let calm = Calm::of([run.calm_frames()]);
+            format!("{laps} completed in {time_s:.1} s, {:.0} wheel reversals/min", calm.reversals_per_min)
+        }
     }
 }

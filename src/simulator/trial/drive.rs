@@ -4,10 +4,9 @@ use std::time::Instant;
 
 use rayon::prelude::*;
 
+use crate::calm::Calm;
 use crate::observer::{Observer, Progress, Tally};
-use crate::simulator::car::speed::Speed;
 use crate::simulator::track::Track;
-use crate::simulator::trial::calm::Calm;
 use crate::simulator::trial::driver::{Driver, Expert};
 use crate::simulator::trial::event::DriveEvent;
 use crate::simulator::trial::outcome::{Failure, INTERVENTION_M, Trial, autonomy_percent, line_errors_m};
@@ -30,7 +29,7 @@ pub fn drive<F>(
 where
     F: Fn() -> Result<Box<dyn Driver>> + Sync,
 {
-    check(options)?;
+    options.check()?;
     let tally = Tally::new(options.runs, observer);
     let measured: Vec<Measured> = (0..options.runs as u64)
         .into_par_iter()
@@ -56,7 +55,7 @@ pub fn drive_observed<F>(
 where
     F: Fn() -> Result<Box<dyn Driver>>,
 {
-    check(options)?;
+    options.check()?;
     let runs = 0..options.runs as u64;
     let measured =
         runs.map(|k| measure(track, &new_driver, options, k, Some(&mut *observer))).collect::<Result<_>>()?;
@@ -113,7 +112,7 @@ fn put_together(track: &Track, options: &DriveOptions, measured: Vec<Measured>, 
     let sum = |of: fn(&Measured) -> f64| measured.iter().map(of).sum::<f64>();
     let (simulated_s, busy_s) = (sum(|m| m.simulated_s), sum(|m| m.busy_s));
     let (expert_sum, expert_s) = (sum(|m| m.expert.whiteness_sum), sum(|m| m.expert.time_s));
-    let expert_calm = Some(Calm::of(measured.iter().map(|m| &m.expert)));
+    let expert_calm = Some(Calm::of(measured.iter().map(|m| m.expert.calm_frames())));
     let realtime_factor = simulated_s / busy_s.max(1e-9) * threads.min(options.runs) as f64;
     let runs: Vec<TrialPair> = measured.into_iter().map(|m| m.pair).collect();
     let summary = DriveSummary {
@@ -123,25 +122,6 @@ fn put_together(track: &Track, options: &DriveOptions, measured: Vec<Measured>, 
         ..summarise(track, options, &runs)
     };
     DriveResult { trials: runs, summary }
-}
-
-fn check(options: &DriveOptions) -> Result<()> {
-    let fail = |message: String| Err(Error::Usage(message));
-    if options.laps == 0 || options.runs == 0 {
-        return fail("laps and runs must be at least 1".to_string());
-    }
-    if let Speed::Fixed(mph) | Speed::Driver(mph) = options.speed
-        && !(3.0..=30.0).contains(&mph)
-    {
-        return fail(format!("speed {mph} mph: 3 to 30 mph can be driven, or `auto`"));
-    }
-    if !(0.0..=2000.0).contains(&options.latency_ms) {
-        return fail(format!("latency {} ms: 0 to 2000 ms can be simulated", options.latency_ms));
-    }
-    if !(0.0..=1.0).contains(&options.noise) {
-        return fail(format!("noise {}: a standard deviation of the steering from 0 to 1 is meant", options.noise));
-    }
-    Ok(())
 }
 
 fn summarise(track: &Track, options: &DriveOptions, runs: &[TrialPair]) -> DriveSummary {
@@ -173,7 +153,7 @@ fn summarise(track: &Track, options: &DriveOptions, runs: &[TrialPair]) -> Drive
         mean_speed_mph: free().map(|m| m.speed_mph).sum::<f64>() / free().count().max(1) as f64,
         whiteness_deg_s: (sum(&|r| r.free.whiteness_sum) / time_s).sqrt(),
         expert_whiteness_deg_s: 0.0,
-        calm: Some(Calm::of(runs.iter().map(|r| &r.free))),
+        calm: Some(Calm::of(runs.iter().map(|r| r.free.calm_frames()))),
         expert_calm: None,
         realtime_factor: 0.0,
     }
@@ -201,8 +181,8 @@ pub fn compare(a: &DriveResult, b: &DriveResult) -> Result<Vec<PairedTest>> {
         test("laps completed", &|r| r.free.laps_completed as f64),
         test("distance from the line in assisted runs, m", &mean_cte),
         test("whiteness, deg/s", &|r| r.free.whiteness_deg_s()),
-        test("wheel reversals a minute", &|r| Calm::of([&r.free]).reversals_per_min),
-        test("lateral jerk, m/s³", &|r| Calm::of([&r.free]).lateral_jerk_rms_mps3),
+        test("wheel reversals a minute", &|r| Calm::of([r.free.calm_frames()]).reversals_per_min),
+        test("lateral jerk, m/s³", &|r| Calm::of([r.free.calm_frames()]).lateral_jerk_rms_mps3),
     ])
 }
 
@@ -210,6 +190,7 @@ pub fn compare(a: &DriveResult, b: &DriveResult) -> Result<Vec<PairedTest>> {
 mod tests {
     use super::*;
     use crate::observer::Unobserved;
+    use crate::simulator::car::speed::Speed;
     use crate::simulator::trial::driver::Zero;
 
     fn go(track: &str, expert: bool, runs: usize) -> DriveResult {

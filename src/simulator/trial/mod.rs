@@ -1,6 +1,5 @@
 //! A measured drive: one trial, many trials, their statistics and their trajectories.
 
-pub mod calm;
 pub mod closed_loop;
 pub mod drive;
 pub mod driver;

@@ -1,6 +1,7 @@
 //! How a trial is driven, and what it came to.
 
-use crate::simulator::car::dynamics::STEP_S;
+use crate::calm::CalmFrame;
+use crate::simulator::car::dynamics::{MAX_STEER_DEG, MPS_PER_MPH, STEP_S};
 use crate::simulator::car::speed::Speed;
 use crate::statistics::quantile;
 
@@ -80,6 +81,18 @@ impl Trial {
     /// Root mean square rate of the steering, deg/s.
     pub fn whiteness_deg_s(&self) -> f64 {
         (self.whiteness_sum / self.time_s.max(STEP_S)).sqrt()
+    }
+
+    /// The moments and the time, s, as [`Calm::of`](crate::calm::Calm::of) takes them.
+    pub fn calm_frames(&self) -> (Vec<CalmFrame>, f64) {
+        let frames = self.moments.iter().map(|moment| CalmFrame {
+            time_s: moment.time_s,
+            angle_deg: moment.steering * MAX_STEER_DEG,
+            heading_deg: moment.heading_deg,
+            speed_mps: moment.speed_mph * MPS_PER_MPH,
+            put_back: moment.intervention,
+        });
+        (frames.collect(), self.time_s)
     }
 
     /// Mean speed over the moments, mph.

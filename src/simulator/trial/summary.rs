@@ -2,9 +2,10 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::calm::Calm;
 use crate::simulator::car::speed::Speed;
-use crate::simulator::trial::calm::Calm;
 use crate::simulator::trial::outcome::{Trial, TrialOptions};
+use crate::{Error, Result};
 
 /// How a driver is put to the test.
 #[derive(Clone, Debug)]
@@ -30,6 +31,29 @@ impl Default for DriveOptions {
 }
 
 impl DriveOptions {
+    /// Checks that all of it can be driven.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] with what is possible.
+    pub fn check(&self) -> Result<()> {
+        let fail = |message: String| Err(Error::Usage(message));
+        if self.laps == 0 || self.runs == 0 {
+            return fail("laps and runs must be at least 1".to_string());
+        }
+        if let Speed::Fixed(mph) | Speed::Driver(mph) = self.speed
+            && !(3.0..=30.0).contains(&mph)
+        {
+            return fail(format!("speed {mph} mph: 3 to 30 mph can be driven, or `auto`"));
+        }
+        if !(0.0..=2000.0).contains(&self.latency_ms) {
+            return fail(format!("latency {} ms: 0 to 2000 ms can be simulated", self.latency_ms));
+        }
+        if !(0.0..=1.0).contains(&self.noise) {
+            return fail(format!("noise {}: a standard deviation of the steering from 0 to 1 is meant", self.noise));
+        }
+        Ok(())
+    }
+
     /// How a trial of the drive is driven, free or assisted.
     pub fn trial_options(&self, assisted: bool) -> TrialOptions {
         let DriveOptions { laps, speed, latency_ms, noise, .. } = *self;

@@ -2,14 +2,27 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::simulator::car::dynamics::{MAX_STEER_DEG, MPS_PER_MPH};
-use crate::simulator::trial::outcome::{Moment, Trial};
 use crate::statistics::quantile;
 
 /// A turn of the wheel back by more than this is a reversal, deg of the front wheels.
 const REVERSAL_DEG: f64 = 1.0;
 
-/// How calm a drive is. A trial's frames come at 20 Hz; pairs of frames between which the car was put back count for nothing.
+/// The car at one frame of a drive.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct CalmFrame {
+    /// Time since the start, s.
+    pub time_s: f64,
+    /// Angle of the front wheels that the driver asked for, deg.
+    pub angle_deg: f64,
+    /// Where the car points, deg.
+    pub heading_deg: f64,
+    /// Speed, m/s.
+    pub speed_mps: f64,
+    /// Whether the car was just put back: it begins anew.
+    pub put_back: bool,
+}
+
+/// How calm a drive is. Pairs of frames between which the car was put back count for nothing.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Calm {
     /// Wheel reversals a minute (Markkula and Engström 2006): times that the front wheels turn back by more than 1 degree from
@@ -23,16 +36,15 @@ pub struct Calm {
 }
 
 impl Calm {
-    /// The measures over all `trials` together.
-    pub fn of<'a>(trials: impl IntoIterator<Item = &'a Trial>) -> Calm {
+    /// The measures over all `drives` together, each with its frames and its time in s.
+    pub fn of(drives: impl IntoIterator<Item = (Vec<CalmFrame>, f64)>) -> Calm {
         let (mut reversals, mut time_s, mut changes_deg) = (0, 0.0, Vec::new());
         let (mut jerk_squares, mut jerks) = (0.0, 0usize);
-        for trial in trials {
-            time_s += trial.time_s;
-            // A car that was put back begins anew.
-            for way in trial.moments.chunk_by(|_, next| !next.intervention) {
-                reversals += count_reversals(way.iter().map(angle_deg));
-                changes_deg.extend(way.windows(2).map(|pair| (angle_deg(&pair[1]) - angle_deg(&pair[0])).abs()));
+        for (frames, of_drive_s) in drives {
+            time_s += of_drive_s;
+            for way in frames.chunk_by(|_, next| !next.put_back) {
+                reversals += count_reversals(way.iter().map(|frame| frame.angle_deg));
+                changes_deg.extend(way.windows(2).map(|pair| (pair[1].angle_deg - pair[0].angle_deg).abs()));
                 let accelerations: Vec<[f64; 2]> = way.windows(2).filter_map(lateral_acceleration).collect();
                 for pair in accelerations.windows(2) {
                     let jerk = (pair[1][1] - pair[0][1]) / (pair[1][0] - pair[0][0]);
@@ -50,16 +62,12 @@ impl Calm {
     }
 }
 
-fn angle_deg(moment: &Moment) -> f64 {
-    moment.steering * MAX_STEER_DEG
-}
-
-/// Time halfway between two moments, s, and the lateral acceleration between them, m/s².
-fn lateral_acceleration(pair: &[Moment]) -> Option<[f64; 2]> {
+/// Time halfway between two frames, s, and the lateral acceleration between them, m/s².
+fn lateral_acceleration(pair: &[CalmFrame]) -> Option<[f64; 2]> {
     let (a, b) = (&pair[0], &pair[1]);
     let dt_s = b.time_s - a.time_s;
     let turn_deg = (b.heading_deg - a.heading_deg + 180.0).rem_euclid(360.0) - 180.0;
-    let speed_mps = 0.5 * (a.speed_mph + b.speed_mph) * MPS_PER_MPH;
+    let speed_mps = 0.5 * (a.speed_mps + b.speed_mps);
     (dt_s > 0.0).then(|| [0.5 * (a.time_s + b.time_s), speed_mps * turn_deg.to_radians() / dt_s])
 }
 
@@ -87,18 +95,18 @@ fn count_reversals(angles_deg: impl Iterator<Item = f64>) -> u32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::simulator::car::dynamics::{STEP_S, WHEELBASE_M};
 
-    /// A trial of which frame `k` at `k · dt_s` shows what `frame` says: angle of the front wheels and heading, deg.
-    fn trial(frames: usize, dt_s: f64, frame: impl Fn(f64) -> (f64, f64)) -> Trial {
-        let moments = (0..frames).map(|k| {
+    /// 20 mph.
+    const SPEED_MPS: f64 = 8.9408;
+
+    /// A drive of which frame `k` at `k · dt_s` shows what `frame` says: angle of the front wheels and heading, deg.
+    fn drive(frames: usize, dt_s: f64, frame: impl Fn(f64) -> (f64, f64)) -> (Vec<CalmFrame>, f64) {
+        let frames_of = (0..frames).map(|k| {
             let time_s = k as f64 * dt_s;
             let (angle_deg, heading_deg) = frame(time_s);
-            let steering = angle_deg / MAX_STEER_DEG;
-            let (x, y, s_m, cte_m, throttle) = (0.0, 0.0, 0.0, 0.0, 0.0);
-            Moment { time_s, x, y, heading_deg, s_m, cte_m, steering, throttle, speed_mph: 20.0, intervention: false }
+            CalmFrame { time_s, angle_deg, heading_deg, speed_mps: SPEED_MPS, put_back: false }
         });
-        Trial { moments: moments.collect(), time_s: frames as f64 * dt_s, ..Trial::default() }
+        (frames_of.collect(), frames as f64 * dt_s)
     }
 
     #[test]
@@ -120,9 +128,9 @@ mod tests {
     fn a_swaying_car_has_the_figures_of_its_sine() {
         // Heading 2 deg · sin(w t) at 20 mph: the acceleration has the amplitude v · A · w, the jerk v · A · w².
         let (a_deg, w): (f64, f64) = (2.0, 1.5);
-        let swaying = trial(4000, 0.05, |t| (3.0 * (w * t).sin(), a_deg * (w * t).sin()));
-        let calm = Calm::of([&swaying]);
-        let jerk = 20.0 * MPS_PER_MPH * a_deg.to_radians() * w * w / 2f64.sqrt();
+        let swaying = drive(4000, 0.05, |t| (3.0 * (w * t).sin(), a_deg * (w * t).sin()));
+        let calm = Calm::of([swaying]);
+        let jerk = SPEED_MPS * a_deg.to_radians() * w * w / 2f64.sqrt();
         approx::assert_relative_eq!(calm.lateral_jerk_rms_mps3, jerk, max_relative = 5e-3);
         approx::assert_relative_eq!(
             calm.reversals_per_min,
@@ -135,20 +143,20 @@ mod tests {
 
     #[test]
     fn a_circle_is_calm_whatever_direction_it_passes_through() {
-        let radius_m = WHEELBASE_M / 5f64.to_radians().tan();
-        let rate_deg = (20.0 * MPS_PER_MPH / radius_m).to_degrees();
-        let circle = trial(2000, 0.05, |t| (5.0, (170.0 + rate_deg * t + 180.0).rem_euclid(360.0) - 180.0));
-        let calm = Calm::of([&circle]);
+        let radius_m = 2.87 / 5f64.to_radians().tan();
+        let rate_deg = (SPEED_MPS / radius_m).to_degrees();
+        let circle = drive(2000, 0.05, |t| (5.0, (170.0 + rate_deg * t + 180.0).rem_euclid(360.0) - 180.0));
+        let calm = Calm::of([circle]);
         assert_eq!((calm.reversals_per_min, calm.angle_change_p95_deg), (0.0, 0.0));
         assert!(calm.lateral_jerk_rms_mps3 < 1e-6, "{calm:?}");
     }
 
     #[test]
     fn putting_the_car_back_is_no_movement_of_the_wheel() {
-        let mut put_back = trial(200, 2.0 * STEP_S, |t| if t < 4.0 { (3.0, 0.0) } else { (-3.0, 90.0) });
-        assert!(Calm::of([&put_back]).lateral_jerk_rms_mps3 > 1.0);
-        put_back.moments[100].intervention = true;
-        assert_eq!(Calm::of([&put_back]), Calm::default());
+        let mut put_back = drive(200, 0.04, |t| if t < 4.0 { (3.0, 0.0) } else { (-3.0, 90.0) });
+        assert!(Calm::of([put_back.clone()]).lateral_jerk_rms_mps3 > 1.0);
+        put_back.0[100].put_back = true;
+        assert_eq!(Calm::of([put_back]), Calm::default());
         assert_eq!(Calm::of([]), Calm::default());
     }
 }
