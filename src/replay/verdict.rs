@@ -338,7 +338,9 @@ mod tests {
     fn judging_ends_on_request() {
         let recordings = [recording_of(&[0.1; 40], 100)];
         let side = Side { name: "training", rows: (0..40).map(|row| (0, row)).collect() };
-        let judged = |stop: &StopSignal| judge(&recordings, &[side.clone()], 25.0, || Ok(|_: &RgbImage| Ok(0.0)), stop);
+        let judged = |stop: &StopSignal| {
+            judge(&recordings, std::slice::from_ref(&side), 25.0, || Ok(|_: &RgbImage| Ok(0.0)), stop)
+        };
         let stop = StopSignal::default();
         assert!(judged(&stop).is_ok());
         stop.request();
