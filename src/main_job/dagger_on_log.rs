@@ -234,8 +234,9 @@ fn found(out: &Path) -> Result<Option<Views>> {
         return Ok(Some(Views { folders: all, met, unreadable: Vec::new() }));
     }
     // Those of a round that was stopped between two folders are not whole.
-    let beside = (2..).map(|camera| of_camera(out, camera)).take_while(|path| path.exists());
-    beside.into_iter().try_for_each(|path| std::fs::remove_dir_all(&path).map_err(Error::io(&path)))?;
+    for path in (2..).map(|camera| of_camera(out, camera)).take_while(|path| path.exists()) {
+        std::fs::remove_dir_all(&path).map_err(Error::io(&path))?;
+    }
     Ok(None)
 }
 
