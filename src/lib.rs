@@ -209,7 +209,7 @@ pub mod serve;
 pub mod simulator;
 #[cfg(feature = "serve")]
 pub mod simulator_client;
-#[cfg(feature = "simulator")]
+#[cfg(feature = "training")]
 mod statistics;
 mod suggestion;
 #[cfg(feature = "training")]
