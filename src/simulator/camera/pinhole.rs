@@ -92,7 +92,7 @@ impl Camera {
         Camera::placed(body, mount.place_m(), PITCH_YAW_ROLL_DEG)
     }
 
-    /// A camera at `place_m` in the body, turned as said: see [`Mount::place_m`] and [`PITCH_YAW_ROLL_DEG`].
+    /// A camera at `place_m` in the body, turned as said: see [`Mount::place_m`] and `PITCH_YAW_ROLL_DEG`.
     ///
     /// Rotations are applied in Unity's order: roll, then pitch, then yaw.
     pub fn placed(body: &BodyPose, place_m: [f32; 3], pitch_yaw_roll_deg: [f64; 3]) -> Camera {
