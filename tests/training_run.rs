@@ -250,7 +250,15 @@ fn a_run_with_the_simulators_set_goes_on_with_it_and_tells_of_it() {
     let [log, set] = ["log", "set/lake"].map(|name| folder.path().join(name));
     painted_log::write(&log, 300, "");
     painted_log::write(&set, 500, "");
-    let settings = [LINEAR, "preprocessing.resize=[16, 16]", "batch=16", "epochs=3", "samples.simulator_share=0.4"];
+    // Row 0 of both is straight on; nothing is thinned out.
+    let settings = [
+        LINEAR,
+        "preprocessing.resize=[16, 16]",
+        "batch=16",
+        "epochs=3",
+        "samples.simulator_share=0.4",
+        "balance.keep_zero=1.0",
+    ];
     let request = |out: &str, simulator: &[&Path]| TrainRequest {
         recordings: vec![log.clone()],
         validate: Vec::new(),
