@@ -159,7 +159,7 @@ fn a_person_marks_undoes_reloads_and_training_obeys() {
     // A list puts rows back; a reloaded page knows what is left.
     browser.value("[...document.querySelectorAll('#out button')].find(b => b.textContent === 'put back').click()");
     wait_for_file("exclude = [[121, 121]]\n");
-    browser.value("about = null; location.reload()");
+    browser.reload();
     browser.wait_for(opened);
     browser.wait_for("document.getElementById('counts').textContent === '120 rows, 1 row left out (0.8 %)'");
     // Nothing lies beside a phone's screen, in the dark as in the light.

@@ -83,6 +83,13 @@ impl Browser {
 
     /// Sends a command, and waits for its result.
     pub fn tell(&mut self, method: &str, params: Value) -> Value {
+        let answer = self.ask(method, params);
+        assert!(answer["error"].is_null(), "{method}: {answer}");
+        answer["result"].clone()
+    }
+
+    /// Sends a command, and waits for the answer: its `result` or its `error`.
+    fn ask(&mut self, method: &str, params: Value) -> Value {
         self.sent += 1;
         let mut command = json!({ "id": self.sent, "method": method, "params": params });
         if !self.session.is_empty() {
@@ -93,8 +100,7 @@ impl Browser {
             let Message::Text(text) = self.socket.read().unwrap() else { continue };
             let answer: Value = serde_json::from_str(&text).unwrap();
             if answer["id"] == self.sent {
-                assert!(answer["error"].is_null(), "{method}: {answer}");
-                return answer["result"].clone();
+                return answer;
             }
             if ["Runtime.exceptionThrown", "Log.entryAdded"].contains(&answer["method"].as_str().unwrap_or_default()) {
                 self.complaints.push(text.to_string());
@@ -104,16 +110,29 @@ impl Browser {
 
     /// The value of a JavaScript expression.
     pub fn value(&mut self, expression: &str) -> Value {
-        let result = self.tell("Runtime.evaluate", json!({ "expression": expression, "returnByValue": true }));
+        let result = self.tell("Runtime.evaluate", evaluation(expression));
         assert!(result["exceptionDetails"].is_null(), "{expression}: {result}");
         result["result"]["value"].clone()
     }
 
-    /// Waits until a JavaScript expression is true.
+    /// Loads the page again, and waits until the new one is complete.
+    pub fn reload(&mut self) {
+        self.value("window.isOld = true");
+        self.tell("Page.reload", json!({}));
+        self.wait_for("!window.isOld && document.readyState === 'complete'");
+    }
+
+    /// Waits until a JavaScript expression is true. While a page replaces another, Chromium answers with an error.
     pub fn wait_for(&mut self, expression: &str) {
         let began = Instant::now();
-        while self.value(expression) != true {
-            assert!(began.elapsed() < SILENCE, "never: {expression}; {:?}", self.complaints);
+        loop {
+            let answer = self.ask("Runtime.evaluate", evaluation(expression));
+            let result = &answer["result"];
+            assert!(result["exceptionDetails"].is_null(), "{expression}: {result}");
+            if result["result"]["value"] == true {
+                return;
+            }
+            assert!(began.elapsed() < SILENCE, "never: {expression}; {answer}; {:?}", self.complaints);
             std::thread::sleep(Duration::from_millis(30));
         }
     }
@@ -146,6 +165,11 @@ impl Browser {
         ));
         value.as_u64().unwrap()
     }
+}
+
+/// Parameters of `Runtime.evaluate`.
+fn evaluation(expression: &str) -> Value {
+    json!({ "expression": expression, "returnByValue": true })
 }
 
 impl Drop for Browser {
