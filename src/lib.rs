@@ -189,7 +189,7 @@ pub mod main_job;
 pub mod metrics;
 #[cfg(feature = "training")]
 pub mod model_file;
-#[cfg(any(feature = "live", feature = "serve"))]
+#[cfg(feature = "serve")]
 mod net;
 #[cfg(feature = "training")]
 pub mod observer;

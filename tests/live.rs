@@ -8,8 +8,9 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use common::command::{error, json};
+use common::double::SILENCE;
 use common::page::{Page, serve};
-use common::served::{Served, random_model};
+use common::served::{Client, Served, command, random_model, sample_jpeg, telemetry};
 use serde_json::{Value, json};
 use steersman::dataset;
 use steersman::picture::{RgbImage, decode::decode_rgb};
@@ -307,4 +308,73 @@ fn idle_connections_make_room_and_a_page_in_use_keeps_its_seat() {
     );
     served.interrupt();
     assert_eq!(served.code(), Some(130));
+}
+
+#[test]
+fn beside_a_server_keys_take_the_wheel_from_the_model_and_the_rows_are_marked() {
+    let folder = tempfile::tempdir().unwrap();
+    let dir = folder.path();
+    random_model(&dir.join("model"), "lenet");
+    let served = Served::start(dir, "model", &["--page=0", "--record", "corrections"]);
+    let said = served.wait_until_it_says("in a browser to take the wheel");
+    let port = said.split("open http://127.0.0.1:").nth(1).unwrap().split('/').next().unwrap().parse().unwrap();
+    let mut car = served.connect_simulator();
+    let jpeg = sample_jpeg();
+    let turn = |car: &mut Client| {
+        car.send(&telemetry(10.0, &jpeg));
+        command(&car.next())
+    };
+    let (of_model, throttle) = turn(&mut car);
+    assert!(throttle > 0.0 && of_model < 0.9, "{of_model} {throttle}");
+    let mut page = Page::open(port);
+    assert_eq!(turn(&mut car).0, of_model, "a page that is only open does not drive");
+    let frame = page.next().unwrap();
+    assert_eq!(frame.camera, jpeg);
+    assert_eq!(frame.state["takeover"]["by_user"], false);
+    // A held key turns the wheel to full lock, while the server holds the speed.
+    let began = Instant::now();
+    let mut driven = (of_model, 0.0);
+    while driven.0 < 1.0 {
+        assert!(began.elapsed() < SILENCE, "{driven:?}");
+        page.press(1, 0);
+        std::thread::sleep(Duration::from_millis(20));
+        driven = turn(&mut car);
+    }
+    assert!(driven.1 > 0.0, "{driven:?}");
+    let state = loop {
+        let state = page.next().unwrap().state;
+        if state["steering"] == 1.0 {
+            break state;
+        }
+    };
+    assert_eq!(state["takeover"]["by_user"], true);
+    assert!((state["expert"].as_f64().unwrap() - of_model).abs() < 1e-6, "the model is asked all the time: {state}");
+    assert!(state["takeover"]["rows"].as_u64().unwrap() > 0, "{state}");
+    // Whoever lets go gives the wheel back, and a page that leaves does so at once.
+    while turn(&mut car).0 != of_model {
+        assert!(began.elapsed() < SILENCE);
+        page.press(0, 0);
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    page.press(1, 0);
+    while turn(&mut car).0 == of_model {
+        assert!(began.elapsed() < SILENCE);
+    }
+    page.ask(&json!({ "type": "leave" }));
+    while turn(&mut car).0 != of_model {
+        assert!(began.elapsed() < SILENCE);
+    }
+    served.interrupt();
+    let words = loop {
+        if let Err(words) = page.next() {
+            break words;
+        }
+    };
+    assert!(words.contains("of them by you"), "{words}");
+    let (summary, said) = served.end();
+    assert!(said.contains("driven from the page"), "{said}");
+    let by_user = summary["recorded"]["by_user"].as_u64().unwrap();
+    let log = std::fs::read_to_string(dir.join("corrections/driving_log.csv")).unwrap();
+    assert_eq!(log.lines().filter(|line| line.ends_with(", user")).count() as u64, by_user);
+    assert!(by_user > 0 && log.contains(", pilot"), "{log}");
 }

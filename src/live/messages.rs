@@ -60,7 +60,7 @@ pub struct Input {
 /// What stays the same during a drive.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct Hello {
-    /// `watch` or `manual`.
+    /// `watch`, `manual` or `beside`: beside the model of a server.
     pub mode: &'static str,
     /// Who steers, or where the recording goes.
     pub subject: String,
@@ -101,6 +101,17 @@ impl Hello {
             saliency: (0..=8).map(|k| palette::saliency_hex(f64::from(k) / 8.0)).collect(),
         }
     }
+
+    /// The greeting for a drive beside `driver`, the model of a server: the place of the car is not known.
+    pub fn beside(driver: String) -> Hello {
+        Hello {
+            mode: "beside",
+            subject: driver,
+            full_lock_deg: MAX_STEER_DEG,
+            palette: [palette::MODEL, palette::REFERENCE],
+            ..Hello::default()
+        }
+    }
 }
 
 /// A point of the trail.
@@ -131,7 +142,7 @@ pub struct State {
     pub heading: [f64; 2],
     /// Steering, [-1, 1], + = right.
     pub steering: f64,
-    /// Steering of the expert at this place, [-1, 1], + = right.
+    /// Steering of the expert at this place, or, beside the model of a server, of the model; [-1, 1], + = right.
     pub expert: f64,
     /// Throttle, [-1, 1], from the brake to the accelerator.
     pub throttle: f64,
@@ -148,6 +159,9 @@ pub struct State {
     /// State of the recording, when a person drives.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub manual: Option<Manual>,
+    /// Who has the wheel, beside the model of a server.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub takeover: Option<Takeover>,
 }
 
 impl State {
@@ -185,6 +199,17 @@ pub struct Manual {
     pub coverage: Shares,
     /// What to do next, the most important first.
     pub advice: Vec<String>,
+}
+
+/// Who has the wheel of a car that a server drives.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct Takeover {
+    /// Connection that may steer.
+    pub driver: Option<u64>,
+    /// Whether the command is the person's.
+    pub by_user: bool,
+    /// Rows recorded so far in which the person steered; `None` without a recording.
+    pub rows: Option<u64>,
 }
 
 /// The last message.
