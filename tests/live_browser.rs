@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use common::browser::Browser;
 use common::command::json;
 use common::page::serve;
-use common::served::random_model;
+use common::served::{Served, command, random_model, sample_jpeg, telemetry};
 use serde_json::json;
 
 /// Fails if something does not fit into the window, or is cut off.
@@ -141,17 +141,9 @@ fn a_phone_in_the_dark_drives_with_a_finger_on_each_pedal() {
     let Some(mut browser) = Browser::open(&format!("http://127.0.0.1:{}/", served.port), [390, 844]) else { return };
     browser.wait_for("document.getElementById('link')?.textContent === 'you drive'");
     for scheme in ["light", "dark"] {
-        let features = json!({ "features": [{ "name": "prefers-color-scheme", "value": scheme }] });
-        browser.tell("Emulation.setEmulatedMedia", features);
-        let fits = "document.documentElement.scrollWidth <= document.documentElement.clientWidth";
-        assert_eq!(browser.value(fits), true, "{scheme}");
-        let pale = "(() => { const light = text => { const [r, g, b] = text.match(/[0-9.]+/g).map(v => v / 255)\
-            .map(v => v <= .04045 ? v / 12.92 : ((v + .055) / 1.055) ** 2.4); return .2126 * r + .7152 * g + .0722 * b; };\
-            const paper = light(getComputedStyle(document.body).backgroundColor);\
-            return [...document.querySelectorAll('h1, p, figcaption, .gauge, #subject, #link')]\
-            .filter(e => e.offsetParent && e.textContent.trim()).map(e => [light(getComputedStyle(e).color), e.outerHTML])\
-            .filter(([ink]) => (Math.max(ink, paper) + .05) / (Math.min(ink, paper) + .05) < 4.5).map(([, html]) => html); })()";
-        assert_eq!(browser.value(pale), json!([]), "contrast, {scheme}");
+        browser.prefer(scheme);
+        browser.assert_no_sideways_scrolling(scheme);
+        browser.assert_contrast("h1, p, figcaption, .gauge, #subject, #link", scheme);
     }
     assert!(browser.colours("map") > 4 && browser.colours("chart") > 4);
     let [x, y] = browser.middle("accelerate");
@@ -165,4 +157,49 @@ fn a_phone_in_the_dark_drives_with_a_finger_on_each_pedal() {
     browser.mouse("mouseReleased", x, y);
     assert!(browser.complaints.is_empty(), "{:?}", browser.complaints);
     served.stop();
+}
+
+#[test]
+fn beside_a_server_the_arrow_keys_take_the_wheel() {
+    let folder = tempfile::tempdir().unwrap();
+    random_model(&folder.path().join("model"), "lenet");
+    let served = Served::start(folder.path(), "model", &["--page=0", "--record", "corrections"]);
+    let said = served.wait_until_it_says("in a browser to take the wheel");
+    let url = said.lines().find_map(|line| line.strip_prefix("open ")?.split(' ').next()).unwrap().to_string();
+    let Some(mut browser) = Browser::open(&url, [1024, 768]) else { return };
+    browser.wait_for("document.getElementById('link')?.textContent === 'connected'");
+    let mut car = served.connect_simulator();
+    let jpeg = sample_jpeg();
+    let mut turn = || {
+        car.send(&telemetry(10.0, &jpeg));
+        command(&car.next()).0
+    };
+    let of_model = turn();
+    browser.wait_for("document.getElementById('who').textContent === 'the model drives' && state !== null");
+    assert!(browser.colours("camera") > 50);
+    for (size, scheme) in [([1600, 900], "light"), ([1024, 768], "dark"), ([390, 844], "dark")] {
+        browser.prefer(scheme);
+        browser.resize(size);
+        browser.wait_for(&format!("innerWidth === {}", size[0]));
+        browser.assert_no_sideways_scrolling(&format!("{scheme}, {size:?}"));
+        browser.assert_contrast("h1, p, figcaption, .gauge, #subject, #link, #who", scheme);
+        turn();
+    }
+    browser.key("ArrowRight", true);
+    let began = Instant::now();
+    while turn() < 1.0 {
+        assert!(began.elapsed() < Duration::from_secs(60));
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    browser.wait_for("document.getElementById('who').textContent === 'you drive'");
+    browser.key("ArrowRight", false);
+    while turn() != of_model {
+        assert!(began.elapsed() < Duration::from_secs(60));
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    browser.wait_for("document.getElementById('who').textContent === 'the model drives'");
+    browser.wait_for("/Recorded with your steering: [1-9]/.test(document.getElementById('corrected').textContent)");
+    assert!(browser.complaints.is_empty(), "{:?}", browser.complaints);
+    served.stop();
+    browser.wait_for("document.getElementById('over').textContent.includes('of them by you')");
 }
