@@ -69,7 +69,7 @@
 //! let mut observer = |event| {
 //!     match event {
 //!         TrainingEvent::Notice(text) => println!("{text}"),
-//!         TrainingEvent::Batch { .. } => {}
+//!         TrainingEvent::Begin { .. } | TrainingEvent::Batch { .. } => {}
 //!         TrainingEvent::Epoch { record, of } => println!("epoch {} of {of}: loss {:.4}", record.epoch, record.train_loss),
 //!     }
 //!     Ok(())

@@ -378,3 +378,36 @@ fn beside_a_server_keys_take_the_wheel_from_the_model_and_the_rows_are_marked() 
     assert_eq!(log.lines().filter(|line| line.ends_with(", user")).count() as u64, by_user);
     assert!(by_user > 0 && log.contains(", pilot"), "{log}");
 }
+
+#[test]
+fn a_training_is_watched_and_its_page_ends_with_the_report_that_is_on_disk() {
+    let folder = tempfile::tempdir().unwrap();
+    let sample = Path::new(env!("CARGO_MANIFEST_DIR")).join("data/sample");
+    let args = ["train", sample.to_str().unwrap(), "--recipe", "lenet", "--set", "epochs=4", "--out", "run", "--watch"];
+    let served = serve(folder.path(), &[&args[..], &["--json"]].concat());
+    let get = |path: &str, host: &str| served.ask(&format!("GET {path} HTTP/1.1\r\nHost: {host}\r\n\r\n"));
+    let own = format!("127.0.0.1:{}", served.port);
+    for (path, host, status) in [("/", "evil.example", "403"), ("/x", &own[..], "404"), ("/", &own, "200")] {
+        assert!(get(path, host).starts_with(&format!("HTTP/1.1 {status}")), "{path} {host}");
+    }
+    let state = || -> Value { serde_json::from_str(get("/state", &own).split("\r\n\r\n").nth(1).unwrap()).unwrap() };
+    let (began, mut reports) = (Instant::now(), Vec::new());
+    let last = loop {
+        let state = state();
+        let number = state["report"].as_u64().unwrap();
+        if number > 0 && reports.last().is_none_or(|(last, _)| *last < number) {
+            let page = get("/report", &own).split_once("\r\n\r\n").unwrap().1.to_string();
+            reports.push((number, page));
+        }
+        if !state["over"].is_null() {
+            break state;
+        }
+        assert!(began.elapsed() < SILENCE, "{state}");
+        std::thread::sleep(Duration::from_millis(20));
+    };
+    let (result, _) = served.end();
+    assert!(last["over"].as_str().unwrap().contains(result["model"].as_str().unwrap()), "{last}");
+    assert_eq!((&last["run"], &last["epoch"], &last["epochs"]), (&json!("run"), &json!(4), &json!(4)));
+    let (_, page) = reports.last().unwrap();
+    assert_eq!(*page, fs::read_to_string(folder.path().join("run/report.html")).unwrap());
+}

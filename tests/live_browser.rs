@@ -203,3 +203,34 @@ fn beside_a_server_the_arrow_keys_take_the_wheel() {
     served.stop();
     browser.wait_for("document.getElementById('over').textContent.includes('of them by you')");
 }
+
+#[test]
+fn a_training_shows_its_report_while_it_runs_and_says_at_the_end_how_to_go_on() {
+    let folder = tempfile::tempdir().unwrap();
+    let sample = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("data/sample");
+    let args =
+        ["train", sample.to_str().unwrap(), "--recipe", "lenet", "--set", "epochs=10000", "--out", "run", "--watch"];
+    let served = serve(folder.path(), &args);
+    let Some(mut browser) = Browser::open(&format!("http://127.0.0.1:{}/", served.port), [1280, 900]) else { return };
+    let inside = "document.getElementById('report').contentDocument";
+    browser.wait_for(&format!(
+        "typeof shown !== 'undefined' && shown > 1 && {inside}?.body?.textContent.includes('The worst frames')"
+    ));
+    browser.wait_for("/epoch \\d+\\/10000, .* images\\/s, .* left/.test(document.getElementById('doing').textContent)");
+    let errors = browser.value(&format!("{inside}.querySelectorAll('svg').length > 2"));
+    assert_eq!(errors, true, "the curves are drawn");
+    for (size, scheme) in [([1280, 900], "light"), ([1280, 900], "dark"), ([390, 844], "dark")] {
+        browser.prefer(scheme);
+        browser.resize(size);
+        browser.wait_for(&format!("innerWidth === {}", size[0]));
+        browser.assert_no_sideways_scrolling(&format!("{scheme}, {size:?}"));
+        let fits = format!("{inside}.documentElement.scrollWidth <= {inside}.documentElement.clientWidth");
+        browser.wait_for(&format!("{inside}?.readyState === 'complete' && {fits}"));
+        browser.assert_contrast("h1, #doing, #link, summary", scheme);
+    }
+    served.interrupt();
+    browser.wait_for("document.getElementById('over').textContent.includes('--resume run')");
+    browser.wait_for(&format!("{inside}?.body?.textContent.includes('This run was stopped after')"));
+    assert!(browser.complaints.is_empty(), "{:?}", browser.complaints);
+    assert_eq!(served.code(), Some(130));
+}

@@ -6,7 +6,7 @@
 //!
 //! [`Watch`] shows a closed-loop drive in real time, [`WatchRecording`] one on recorded pictures. [`ManualDrive`] lets a person
 //! drive with the page and records the drive; [`Shares`] says what the recording covers so far. [`CoDriverPage`] shows what a
-//! server drives, and a person corrects the model there.
+//! server drives, and a person corrects the model there. [`training::TrainingPage`] shows a training.
 //!
 //! A page of another site must not drive the car. So the `Host` of a request must be this machine (a site can let its name
 //! point here after its page was loaded), and the `Origin` of a WebSocket must be the same.
@@ -19,6 +19,7 @@ mod manual;
 mod messages;
 mod real_time;
 mod server;
+pub mod training;
 mod watch;
 mod watch_recording;
 
