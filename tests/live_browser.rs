@@ -127,6 +127,24 @@ fn a_drive_is_watched_with_its_saliency() {
     }
     let time = browser.value("state.time_s + 100 * state.trail_id").as_f64().unwrap();
     browser.wait_for(&format!("state.time_s + 100 * state.trail_id > {time} + 0.5"));
+    browser.key("Space", true);
+    browser.key("Space", false);
+    browser.wait_for("document.getElementById('rate').textContent === 'paused'");
+    let [x, y] = browser.middle("next");
+    browser.mouse("mousePressed", x, y);
+    browser.mouse("mouseReleased", x, y);
+    browser.wait_for(
+        "!document.getElementById('finished').hidden && document.querySelector('#results td').textContent !== ''",
+    );
+    browser.key("NumpadAdd", true);
+    browser.wait_for("document.getElementById('rate').textContent === '2 times real time'");
+    browser.key("NumpadAdd", false);
+    for size in [[1600, 900], [1024, 768]] {
+        assert_fits(&mut browser, size);
+    }
+    browser.wait_for("history.length > 20");
+    browser.reload();
+    browser.wait_for("typeof history !== 'undefined' && state !== null && history.length > 10");
     assert!(browser.complaints.is_empty(), "{:?}", browser.complaints);
     // The browser stays; the page says that the drive is over.
     served.interrupt();
@@ -175,7 +193,7 @@ fn beside_a_server_the_arrow_keys_take_the_wheel() {
         command(&car.next()).0
     };
     let of_model = turn();
-    browser.wait_for("document.getElementById('who').textContent === 'the model drives' && state !== null");
+    browser.wait_for("document.getElementById('who').textContent === 'the model drives' && history.length > 0");
     assert!(browser.colours("camera") > 50);
     for (size, scheme) in [([1600, 900], "light"), ([1024, 768], "dark"), ([390, 844], "dark")] {
         browser.prefer(scheme);

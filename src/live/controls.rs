@@ -68,6 +68,8 @@ impl Wheel {
             Request::PutBack => Some(Action::PutBack),
             Request::TurnRound => Some(Action::TurnRound),
             Request::Finish => Some(Action::Finish),
+            // These are no one's alone.
+            Request::Pause | Request::Rate { .. } | Request::NextRun => return,
         };
         if self.holder == Some(id) {
             self.heard = Some(now);

@@ -6,11 +6,13 @@
 use serde::{Deserialize, Serialize};
 
 use super::coverage::Shares;
+use super::playback::Playback;
 use crate::report::charts::map;
 use crate::report::charts::palette::{self, heat_hex};
 use crate::simulator::car::dynamics::MAX_STEER_DEG;
 use crate::simulator::car::expert::pursuit;
 use crate::simulator::car::speed::telemetry_mph;
+use crate::simulator::trial::outcome::Failure;
 use crate::simulator::{Simulation, Track};
 
 /// A request of the page.
@@ -37,6 +39,15 @@ pub enum Request {
     TurnRound,
     /// End the drive and finish the recording.
     Finish,
+    /// Let the time of a watched drive stand still, or go on.
+    Pause,
+    /// How fast it goes.
+    Rate {
+        /// Simulated seconds a second.
+        rate: f64,
+    },
+    /// Drive on to the end of this run without showing it in real time.
+    NextRun,
 }
 
 /// Keys, mouse and gamepad. Values out of range count as the nearest value in range.
@@ -114,12 +125,42 @@ impl Hello {
     }
 }
 
+/// The result of a run that is over.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct RunResult {
+    /// Which one, as in `run 2 of 5 (seed 2), without help`.
+    pub run: String,
+    /// Whole laps driven.
+    pub laps: usize,
+    /// Why it ended early.
+    pub failure: Option<Failure>,
+    /// How often the car was put back.
+    pub put_back: usize,
+    /// Simulated time, s.
+    pub time_s: f64,
+    /// Mean distance from the line, m.
+    pub cte_mean_m: f64,
+}
+
 /// A point of the trail.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct TrailPoint(
     /// East, m.
     pub f32,
     /// North, m.
+    pub f32,
+    /// Cross-track error, m.
+    pub f32,
+);
+
+/// A moment of the last seconds, from which the charts are drawn.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct RecentMoment(
+    /// Simulated time, s.
+    pub f64,
+    /// Steering, [-1, 1], + = right.
+    pub f32,
+    /// That of the expert.
     pub f32,
     /// Cross-track error, m.
     pub f32,
@@ -162,6 +203,12 @@ pub struct State {
     /// Who has the wheel, beside the model of a server.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub takeover: Option<Takeover>,
+    /// Results of the last runs that are over.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub results: Vec<RunResult>,
+    /// How fast a watched drive is shown.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub playback: Option<Playback>,
 }
 
 impl State {

@@ -4,7 +4,7 @@
 //! messages: the program sends the [`State`] and pictures, the page sends requests. The page asks for each frame, so a slow
 //! page skips frames and delays nothing.
 //!
-//! [`Watch`] shows a closed-loop drive in real time, [`WatchRecording`] one on recorded pictures. [`ManualDrive`] lets a person
+//! [`Watch`] shows a closed-loop drive in real time, or as fast as the page asks, [`WatchRecording`] one on recorded pictures. [`ManualDrive`] lets a person
 //! drive with the page and records the drive; [`Shares`] says what the recording covers so far. [`CoDriverPage`] shows what a
 //! server drives, and a person corrects the model there. [`training::TrainingPage`] shows a training.
 //!
@@ -17,6 +17,7 @@ mod coverage;
 mod hub;
 mod manual;
 mod messages;
+mod playback;
 mod real_time;
 mod server;
 pub mod training;
@@ -26,7 +27,8 @@ mod watch_recording;
 pub use co_driver_page::CoDriverPage;
 pub use coverage::Shares;
 pub use manual::{ManualDrive, ManualSummary};
-pub use messages::{Hello, Manual, State, Takeover, TrailPoint};
+pub use messages::{Hello, Manual, RunResult, State, Takeover, TrailPoint};
+pub use playback::Playback;
 pub use server::{DEFAULT_PORT, Live};
 pub use watch::Watch;
 pub use watch_recording::WatchRecording;
