@@ -69,7 +69,7 @@
 //! let mut observer = |event| {
 //!     match event {
 //!         TrainingEvent::Notice(text) => println!("{text}"),
-//!         TrainingEvent::Batch { .. } => {}
+//!         TrainingEvent::Begin { .. } | TrainingEvent::Batch { .. } => {}
 //!         TrainingEvent::Epoch { record, of } => println!("epoch {} of {of}: loss {:.4}", record.epoch, record.train_loss),
 //!     }
 //!     Ok(())
@@ -189,7 +189,7 @@ pub mod main_job;
 pub mod metrics;
 #[cfg(feature = "training")]
 pub mod model_file;
-#[cfg(any(feature = "live", feature = "serve"))]
+#[cfg(feature = "serve")]
 mod net;
 #[cfg(feature = "training")]
 pub mod observer;

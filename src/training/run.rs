@@ -66,6 +66,11 @@ pub struct TrainRequest {
 /// What happens in a run.
 #[derive(Clone, Debug, PartialEq)]
 pub enum TrainingEvent {
+    /// A run begins, or goes on.
+    Begin {
+        /// Its folder.
+        folder: PathBuf,
+    },
     /// Something the user should know.
     Notice(String),
     /// A batch is done.
@@ -433,6 +438,7 @@ impl TrainingRun {
     }
 
     fn run(mut self, observer: &mut dyn Observer<TrainingEvent>, stop: &StopSignal) -> Result<TrainResult> {
+        observer.observe(TrainingEvent::Begin { folder: self.folder.path().into() })?;
         for notice in &self.notices {
             observer.observe(TrainingEvent::Notice(notice.clone()))?;
         }
