@@ -88,10 +88,54 @@ fn two_outputs_of_one_trunk_are_steering_and_throttle() {
     }
 }
 
+/// Random layers, resizing in the network and an input's size beside the layers; and an output that is no share of full lock.
+#[test]
+fn students_habits_agree_with_keras() {
+    for file in ["degrees.keras"] {
+        agrees(file, "degrees", &ImportOptions::default());
+        let plain = import(&golden(file), &ImportOptions::default()).unwrap();
+        assert!(plain.notices.iter().filter(|notice| notice.contains("in training only")).count() == 2, "{file}");
+        let options = ImportOptions { output_scale: Some([90.0, -45.0]), ..ImportOptions::default() };
+        let scaled = import(&golden(file), &options).unwrap();
+        let images = images(2, plain.input);
+        let network = Network::new(plain.input, &plain.layers, Isa::best()).unwrap();
+        let answers = [&plain, &scaled].map(|model| network.predict(&model.parameters, images.view()).unwrap());
+        for (degrees, steering) in answers[0].iter().zip(&answers[1]) {
+            assert!((steering - (degrees - 90.0) / -45.0).abs() < 1e-5, "{steering} of {degrees}");
+        }
+    }
+    let options = ImportOptions { output_scale: Some([90.0, 45.0]), ..ImportOptions::default() };
+    let two = import(&golden("donkey.h5"), &options).unwrap();
+    let one = import(&golden("donkey.h5"), &ImportOptions::default()).unwrap();
+    let network = Network::new(two.input, &two.layers, Isa::best()).unwrap();
+    let images = images(1, two.input);
+    let answers = [one, two].map(|model| network.predict(&model.parameters, images.view()).unwrap());
+    assert!((answers[1][[0, 0]] - (answers[0][[0, 0]] - 90.0) / 45.0).abs() < 1e-5);
+    assert_eq!(answers[1][[0, 1]], answers[0][[0, 1]], "the throttle stays");
+}
+
+#[test]
+fn answers_far_beyond_full_lock_are_warned_of() {
+    let folder = tempfile::tempdir().unwrap();
+    let dir = folder.path();
+    image::RgbImage::from_pixel(90, 48, image::Rgb([90, 120, 60])).save(dir.join("a.png")).unwrap();
+    let file = golden("degrees.keras");
+    let file = file.to_str().unwrap();
+    let warnings = |scale: &[&str]| {
+        std::fs::remove_file(dir.join("m.safetensors")).ok();
+        run(dir, &[&["import", file, "--out", "m.safetensors"], scale].concat());
+        String::from_utf8(run(dir, &["predict", "m.safetensors", "a.png"]).stderr).unwrap()
+    };
+    let warned = warnings(&["--output-scale", "0,0.0001"]);
+    assert!(warned.contains("1 of 1 answers lie beyond 2") && warned.contains("--output-scale"), "{warned}");
+    assert_eq!(warnings(&["--output-scale", "0,1000"]), "");
+}
+
 #[test]
 fn files_in_the_style_of_keras_1_and_2_agree_with_it() {
     agrees("keras1.h5", "plain", &ImportOptions::default());
     agrees("keras2.h5", "plain", &ImportOptions::default());
+    agrees("keras2-slashes.h5", "plain", &ImportOptions::default());
     // Theano's axes and kernels, weights alone, the architecture in a string and without the input's size.
     let options = ImportOptions {
         architecture: Some(golden("keras1-theano.json")),

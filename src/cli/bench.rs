@@ -134,7 +134,8 @@ fn measure(recipe: &Recipe, args: &BenchArgs, started: Instant) -> Result<BenchR
     let mut parameters = network.initialize(1);
     // The first step waits for its own batch alone, as in training.
     let mut x = vec![random_numbers(args.batch * network.input().len(), 0)];
-    let labels: Vec<Vec<f32>> = (0..BATCHES).map(|batch| random_numbers(args.batch, 1 << 32 | batch as u64)).collect();
+    let labels: Vec<Vec<f32>> =
+        (0..BATCHES).map(|batch| random_numbers(args.batch * network.output().len(), 1 << 32 | batch as u64)).collect();
 
     let mut plan = TrainingPlan::new(&network, args.batch);
     let mut optimizer = Optimizer::new(recipe.optimizer, recipe.clip_gradient_norm, network.tensors(), network.isa());

@@ -8,6 +8,7 @@ use rayon::prelude::*;
 use serde::Serialize;
 use steersman_kernels::Isa;
 
+use super::far_outputs::notice_far_outputs;
 use super::recording_args::RecordingArgs;
 use super::{load_model, or_dash, pool, print_json};
 use crate::dataset::held_out::trained_on_held_out;
@@ -110,6 +111,7 @@ pub fn run(args: EvaluateArgs) -> Result<()> {
         }
         sessions_before += recording.sessions.len();
     }
+    notice_far_outputs(predictions.iter().map(|prediction| prediction.steering));
     let metrics = Metrics::of(&predictions, full_lock_deg).ok_or_else(|| Error::Data {
         place: "the recordings".into(),
         message: "no row can be used; `steersman inspect` says why".into(),

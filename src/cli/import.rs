@@ -43,6 +43,10 @@ pub struct ImportArgs {
     /// The weights come from Theano before Keras 2: its convolutions turned their kernels by 180 degrees
     #[arg(long)]
     theano_kernels: bool,
+    /// What the steering output says straight on, and how much more at full lock to the right, where that is not 0 and 1: 90,45
+    /// for degrees with 90 in the middle
+    #[arg(long, value_name = "STRAIGHT,SPAN", value_parser = parse_output_scale, allow_hyphen_values = true)]
+    output_scale: Option<[f64; 2]>,
     /// Model file to write; must not exist
     #[arg(long, value_name = "MODEL", required_unless_present = "fit")]
     out: Option<PathBuf>,
@@ -66,6 +70,15 @@ fn parse_lambda(text: &str) -> Result<(String, (f64, f64)), String> {
         return Err("A must not be zero, and both must be finite".into());
     }
     Ok((layer.trim().into(), (a, b)))
+}
+
+fn parse_output_scale(text: &str) -> Result<[f64; 2], String> {
+    let numbers = text.split_once(',').and_then(|(a, b)| Some([a.trim().parse().ok()?, b.trim().parse().ok()?]));
+    let [straight, span]: [f64; 2] = numbers.ok_or("expected two numbers, STRAIGHT,SPAN, as in 90,45")?;
+    if span == 0.0 || !span.is_finite() || !straight.is_finite() {
+        return Err("SPAN must not be zero, and both must be finite".into());
+    }
+    Ok([straight, span])
 }
 
 #[derive(Serialize)]
@@ -102,6 +115,7 @@ pub fn run(args: ImportArgs) -> Result<()> {
         lambdas: args.lambdas.iter().cloned().collect::<BTreeMap<_, _>>(),
         theano_kernels: args.theano_kernels,
         input: given.as_ref().map(shape_of),
+        output_scale: args.output_scale,
     };
     let imported = keras::import(&args.file, &options)?;
     for notice in &imported.notices {
@@ -244,6 +258,14 @@ mod tests {
         assert_eq!(parse_lambda("lambda_1=127.5, 1").unwrap(), ("lambda_1".into(), (127.5, 1.0)));
         for wrong in ["lambda_1", "a=1", "a=x,1", "a=0,1", "a=1,inf"] {
             assert!(parse_lambda(wrong).is_err(), "{wrong}");
+        }
+    }
+
+    #[test]
+    fn an_output_scale_is_two_numbers() {
+        assert_eq!(parse_output_scale("90, -45").unwrap(), [90.0, -45.0]);
+        for wrong in ["90", "90,0", "x,1", "nan,1", "1,inf"] {
+            assert!(parse_output_scale(wrong).is_err(), "{wrong}");
         }
     }
 

@@ -24,6 +24,7 @@ mod experiment;
 mod experiment_replay;
 mod explain;
 mod export;
+mod far_outputs;
 mod fit_camera;
 mod import;
 mod inspect;

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 use serde::Serialize;
 
+use super::far_outputs::notice_far_outputs;
 use super::{end_with, load_pilot, print, print_json};
 use crate::error::{Error, Result};
 use crate::pilot::Answer;
@@ -63,6 +64,8 @@ pub fn run(args: PredictArgs) -> Result<()> {
             }
         }
     }
+    let given = || answers.iter().filter_map(|row| row.steering);
+    notice_far_outputs(given());
     if args.json {
         print_json(&answers)?;
     }

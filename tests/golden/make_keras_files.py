@@ -1,6 +1,6 @@
 """Small Keras files of every kind, with the outputs that Keras gives: `keras/*` and `keras/expected.json`. See README.md.
 
-`keras3`, `functional` and `donkey` are written by Keras itself, in both of its formats. The styles of Keras 1 and 2 are written with h5py in
+`keras3`, `functional`, `donkey` and `degrees` are written by Keras itself, in both of its formats. The styles of Keras 1 and 2 are written with h5py in
 the layout, the names and the spelling that those versions used, from the weights of the model `plain`, and must give its outputs.
 """
 
@@ -133,6 +133,22 @@ def donkey():
     return keras.Model(image, outputs, name="linear")
 
 
+def degrees():
+    """What cars of students have in their models: no input layer, augmentation and resizing in the network, degrees."""
+    model = keras.Sequential([
+        layers.RandomFlip("horizontal"),
+        layers.Resizing(24, 30),
+        layers.RandomBrightness(0.2),
+        layers.Lambda(normalise),
+        layers.Conv2D(4, 5, strides=2, activation="relu"),
+        layers.Resizing(5, 13, interpolation="nearest"),
+        layers.Flatten(),
+        layers.Dense(1),
+    ], name="degrees")
+    model.build((None, 48, 90, 3))
+    return model
+
+
 def lambda_code(base64):
     """The code of x / 127.5 - 1 as Keras 1 wrote it, or as Keras 2 did."""
     code = marshal.dumps(normalise.__code__)
@@ -227,6 +243,7 @@ def tensors(model, th=False, flip=False):
 def write_layers(group, model, order, names, **layout):
     """Keras' `save_weights`: a group a layer, with `weight_names` in order."""
     values = dict(tensors(model, **layout))
+    values.update({name: values[name.split("/")[-1]] for name in order if "/" in name})
     group.attrs["layer_names"] = [name.encode() for name in order]
     for layer in order:
         inner = group.create_group(layer)
@@ -268,6 +285,15 @@ def hand_made(model):
         write_layers(f.create_group("model_weights"), model, names(config), keras2_name)
 
 
+def with_slashes(model):
+    """Keras 2 had slashes in the names of layers."""
+    config = [(kind, f"eyes/{name}" if name.startswith("conv") else name, entries) for kind, name, entries in keras2_config()]
+    with h5py.File(OUT / "keras2-slashes.h5", "w") as f:
+        f.attrs["keras_version"] = b"2.1.2"
+        f.attrs["model_config"] = json.dumps(chain(config)).encode()
+        write_layers(f.create_group("model_weights"), model, [name for _, name, _ in config], keras2_name)
+
+
 def hostile():
     """Files that are valid HDF5 and mean harm."""
     dense = ("Dense", "dense", {"output_dim": 1, "bias": False, "batch_input_shape": [None, 2, 2, 1]})
@@ -302,7 +328,7 @@ def hostile():
 def main():
     OUT.mkdir(exist_ok=True)
     expected = {"keras": keras.__version__, "images": IMAGES}
-    for seed, build in enumerate([keras3, functional, plain, donkey]):
+    for seed, build in enumerate([keras3, functional, plain, donkey, degrees]):
         model = build()
         randomise(model, seed)
         shape = model.input_shape[1:]
@@ -311,9 +337,12 @@ def main():
         expected[build.__name__] = {"input": [int(n) for n in shape], "outputs": [float(v) for v in y]}
         if build is plain:
             hand_made(model)
+            with_slashes(model)
         else:
             model.save(OUT / f"{build.__name__}.keras")
-            model.save(OUT / f"{build.__name__}.h5")
+            # Keras 3.15 cannot write random layers into HDF5.
+            if build is not degrees:
+                model.save(OUT / f"{build.__name__}.h5")
         print(build.__name__, y, model.count_params(), file=sys.stderr)
     hostile()
     (OUT / "expected.json").write_text(json.dumps(expected, indent=1) + "\n")

@@ -33,9 +33,13 @@ CASES = [
     ("lambda x, a=127.5: x / a - 1", None, None),
     ("lambda x: x / 255.0 if x is None else x", None, None),
     ("lambda x: __import__('os').system('false')", None, None),
+    ("def f(x):\n    y = x / 255.0\n    shift = 0.5\n    y = y - shift\n    return y * 2", 2 / 255.0, -1),
+    ("def f(x):\n    if x is None:\n        y = x\n    return y / 2", None, None),
 ]
 
 for source, factor, offset in CASES:
-    code = binascii.hexlify(marshal.dumps(eval(source).__code__)).decode("ascii")
+    names = {}
+    exec(source if source.startswith("def") else "f = " + source, names)
+    code = binascii.hexlify(marshal.dumps(names["f"].__code__)).decode("ascii")
     line = [("python", "%d.%d" % sys.version_info[:2]), ("source", source), ("code", code), ("factor", factor), ("offset", offset)]
     print("{%s}" % ", ".join("%s: %s" % (json.dumps(key), json.dumps(value)) for key, value in line))

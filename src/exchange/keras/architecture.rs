@@ -30,6 +30,8 @@ pub(super) struct Chain {
     pub layers: Vec<KerasLayer>,
     /// How many layers at the end read the same one, each giving outputs of its own, in the order of the outputs; 1 in a plain chain.
     pub heads: usize,
+    /// Extents of the input without the batch, if they stand beside the layers; 0 where they are open.
+    pub input: Option<Vec<usize>>,
     /// Reasons why the layers form no chain. If there are any, the layers stand in the order of the file.
     pub problems: Vec<Problem>,
 }
@@ -63,6 +65,10 @@ pub(super) fn chain(text: &str) -> Result<Chain, String> {
     if entries.is_empty() || entries.len() > MAX_LAYERS {
         return Err(format!("its architecture has {} layers, not 1 to {MAX_LAYERS}", entries.len()));
     }
+    let input = config.get("build_input_shape").and_then(Value::as_array).map(|extents| {
+        let size = |extent: &Value| extent.as_u64().and_then(|extent| usize::try_from(extent).ok()).unwrap_or_default();
+        extents.iter().skip(1).map(size).collect()
+    });
     let mut nodes = Vec::new();
     for (index, entry) in entries.iter().enumerate() {
         nodes.push(node(index, entry)?);
@@ -71,6 +77,7 @@ pub(super) fn chain(text: &str) -> Result<Chain, String> {
         return Ok(Chain {
             layers: nodes.into_iter().map(|node| node.layer).collect(),
             heads: 1,
+            input,
             problems: Vec::new(),
         });
     }
@@ -95,7 +102,7 @@ pub(super) fn chain(text: &str) -> Result<Chain, String> {
         Err(problems) => (layers, problems),
     };
     layers.extend(others);
-    Ok(Chain { layers, heads: names.len().max(1), problems })
+    Ok(Chain { layers, heads: names.len().max(1), input, problems })
 }
 
 /// Names of the dense layers that read one and the same layer and are read by none, in the order of the model's outputs; empty if there
@@ -237,6 +244,8 @@ mod tests {
         assert_eq!(names(&json!({"class_name": "Sequential", "config": {"name": "s", "layers": layers}})), ["a", "b"]);
         let text = json!({"config": layers}).to_string();
         assert_eq!(names(&Value::String(text)), ["a", "b"]);
+        let built = chain(&json!({"config": {"layers": layers, "build_input_shape": [null, 66, null, 3]}}).to_string());
+        assert_eq!(built.unwrap().input, Some(vec![66, 0, 3]));
         let reversed = json!({"config": {"layers": [
             {"class_name": "B", "config": {"name": "b"}, "inbound_nodes": [[["a", 0, 0, {}]]]},
             {"class_name": "A", "config": {"name": "a"}, "inbound_nodes": []},

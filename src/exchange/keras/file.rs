@@ -46,6 +46,19 @@ impl KerasFile {
     }
 
     fn parse(bytes: Vec<u8>) -> Result<KerasFile, String> {
+        if bytes.starts_with(b"version https://git-lfs") {
+            return Err(
+                "is a pointer of Git LFS, not the model itself: `git lfs pull` in its repository fetches the model"
+                    .into(),
+            );
+        }
+        if bytes.get(4..8) == Some(b"TFL3") {
+            return Err(
+                "is a TensorFlow Lite file, which is not read: import the Keras file (.h5 or .keras) that it was made \
+                        from"
+                    .into(),
+            );
+        }
         if bytes.starts_with(b"PK") { KerasFile::from_zip(bytes) } else { KerasFile::from_hdf5(bytes) }
     }
 
@@ -162,7 +175,9 @@ impl Weights {
         if let Ok(names) = strings(&group, "layer_names") {
             let mut layers = Vec::new();
             for name in names {
-                let layer = group.group(&name);
+                // Names of Keras 2 may have slashes, which are groups in groups.
+                let mut parts = name.split('/').filter(|part| !part.is_empty());
+                let layer = parts.try_fold(group.clone(), |group, part| group.group(part));
                 let layer =
                     layer.map_err(|e| format!("layer `{}` has no group of weights: {}", shown(&name), said(e)))?;
                 if !strings(&layer, "weight_names").unwrap_or_default().is_empty() {
@@ -318,6 +333,13 @@ mod tests {
 
     #[test]
     fn what_is_neither_format_is_an_error() {
+        for (bytes, named) in [
+            (&b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n"[..], "git lfs pull"),
+            (b"\x1c\0\0\0TFL3\0\0", "TensorFlow Lite"),
+        ] {
+            let message = KerasFile::parse(bytes.to_vec()).map(drop).unwrap_err();
+            assert!(message.contains(named), "{message}");
+        }
         for bytes in [&b""[..], b"PK\x03\x04", b"hello", b"\x89HDF\r\n\x1a\n"] {
             assert!(KerasFile::parse(bytes.to_vec()).is_err());
         }

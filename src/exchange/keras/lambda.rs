@@ -4,6 +4,8 @@
 //! stack holds constants and expressions `factor · x + offset`. An instruction that is unknown, or that leaves this form,
 //! makes the function unknown; the user then has to say what it computes.
 
+use std::collections::BTreeMap;
+
 use data_encoding::BASE64;
 use serde_json::Value;
 
@@ -85,9 +87,13 @@ pub(super) fn affine(code: &[u8]) -> Option<LambdaAffine> {
 /// An instruction that the evaluation knows.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Instruction {
-    Argument,
-    /// Python 3.13 loads two variables with one instruction.
-    ArgumentTwice,
+    /// Loads a local variable; number 0 is x.
+    Load(usize),
+    /// Stores into a local variable.
+    Store(usize),
+    /// Python 3.13 does two of these with one instruction.
+    LoadLoad(usize, usize),
+    StoreLoad(usize, usize),
     Constant(usize),
     Add,
     Subtract,
@@ -145,7 +151,8 @@ impl Dialect {
                     (27, _) => Divide,
                     (83, _) => Return,
                     (100, _) => Constant(operand),
-                    (124, 0) => Argument,
+                    (124, variable) => Load(variable),
+                    (125, variable) => Store(variable),
                     _ => return None,
                 }));
             }
@@ -156,8 +163,12 @@ impl Dialect {
             // 0 is a cache entry.
             0 => return Some(None),
             _ if opcode == nothing => return Some(None),
-            _ if opcode == load_argument && operand == 0 => Argument,
-            88 if operand == 0 && matches!(self, Dialect::Renumbered) => ArgumentTwice,
+            _ if opcode == load_argument => Load(operand),
+            125 if matches!(self, Dialect::Cached) => Store(operand),
+            110 if matches!(self, Dialect::Renumbered) => Store(operand),
+            // Two variables in one operand, four bits each.
+            88 if matches!(self, Dialect::Renumbered) => LoadLoad(operand >> 4, operand & 15),
+            111 if matches!(self, Dialect::Renumbered) => StoreLoad(operand >> 4, operand & 15),
             _ if opcode == load_constant => Constant(operand),
             _ if opcode == negate => Negate,
             _ if opcode == give_back => Return,
@@ -187,12 +198,21 @@ const ARGUMENT: Symbol = Symbol::Expression(LambdaAffine { factor: 1.0, offset: 
 /// Evaluates the instructions; `None` if they compute anything but one expression in x.
 fn run(instructions: &[Instruction], constants: &[std::rc::Rc<Object>]) -> Option<LambdaAffine> {
     let mut stack = Vec::new();
+    let mut variables = BTreeMap::from([(0, ARGUMENT)]);
     for (place, instruction) in instructions.iter().enumerate() {
         let symbol = match *instruction {
-            Instruction::Argument => ARGUMENT,
-            Instruction::ArgumentTwice => {
-                stack.push(ARGUMENT);
-                ARGUMENT
+            Instruction::Load(variable) => *variables.get(&variable)?,
+            Instruction::Store(variable) => {
+                variables.insert(variable, stack.pop()?);
+                continue;
+            }
+            Instruction::LoadLoad(first, second) => {
+                stack.push(*variables.get(&first)?);
+                *variables.get(&second)?
+            }
+            Instruction::StoreLoad(stored, loaded) => {
+                variables.insert(stored, stack.pop()?);
+                *variables.get(&loaded)?
             }
             Instruction::Constant(index) => match **constants.get(index)? {
                 Object::Integer(value) => Symbol::Number { value: value as f64, whole: true },

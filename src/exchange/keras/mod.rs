@@ -48,6 +48,8 @@ pub struct ImportOptions {
     pub theano_kernels: bool,
     /// Shape of the input for files that leave it out.
     pub input: Option<Shape>,
+    /// The first output straight on, and how much more it is at full lock to the right, where that is not 0 and 1.
+    pub output_scale: Option<[f64; 2]>,
 }
 
 /// An imported network.
@@ -171,15 +173,19 @@ pub fn import(path: &Path, options: &ImportOptions) -> Result<Imported> {
         return Err(wrong(listed(&problems)));
     }
 
-    let input = input_shape(&steps, order, options.input).map_err(wrong)?;
+    let said = steps.iter().find_map(|step| step.input.as_ref()).or(chain.input.as_ref());
+    let input = input_shape(said, order, options.input).map_err(wrong)?;
     let has_weights: Vec<bool> = steps.iter().map(|step| step.operation.has_weights()).collect();
     let tensors = file.weights.of_chain(&chain.layers, &has_weights).map_err(wrong)?;
     let flip_kernels = options.theano_kernels || file.backend.as_deref() == Some("theano");
     let context = Context { input, order, flip_kernels };
     let assembly =
         assemble::assemble(&context, &chain.layers, &steps, &tensors, chain.heads).map_err(|p| wrong(listed(&[p])))?;
-    let Assembly { specs, parameters, ends } = assembly;
+    let Assembly { specs, mut parameters, ends } = assembly;
     let network = Network::new(input, &specs, Isa::PORTABLE)?;
+    if let Some([straight, span]) = options.output_scale {
+        scale_first_output(&network, &mut parameters, straight, span).map_err(wrong)?;
+    }
     let heads = &chain.layers[chain.layers.len() - chain.heads..];
     let names: Vec<&str> = heads.iter().map(|layer| layer.name.as_str()).collect();
     let mut notices = Vec::new();
@@ -225,6 +231,20 @@ pub fn import(path: &Path, options: &ImportOptions) -> Result<Imported> {
     Ok(Imported { input, layers: specs, parameters, outputs, keras_version: file.keras_version, report, notices })
 }
 
+/// Makes the first output of the last dense layer `(y − straight) / span`.
+fn scale_first_output(network: &Network, parameters: &mut Parameters, straight: f64, span: f64) -> Result<(), String> {
+    let last = network.layers().iter().rev().find(|layer| !matches!(layer.spec, LayerSpec::Dropout(_)));
+    let last = last.filter(|layer| matches!(layer.spec, LayerSpec::Dense(_))).ok_or(
+        "--output-scale needs a network that ends with a dense layer without an activation, whose weights it changes",
+    )?;
+    let (inputs, units) = (last.layer.input().len(), last.layer.output().len());
+    let values = &mut parameters.values[last.params.clone()];
+    values[..inputs].iter_mut().for_each(|weight| *weight = (f64::from(*weight) / span) as f32);
+    let bias = &mut values[inputs * units];
+    *bias = ((f64::from(*bias) - straight) / span) as f32;
+    Ok(())
+}
+
 fn read_architecture(path: &Path) -> Result<String> {
     let len = std::fs::metadata(path).map_err(Error::io(path))?.len();
     if len > MAX_JSON_BYTES as u64 {
@@ -247,8 +267,7 @@ fn axis_order(layers: &[architecture::KerasLayer], steps: &[KerasStep], problems
 }
 
 /// Shape of the input: what the file says, or else what the user's preprocessing gives.
-fn input_shape(steps: &[KerasStep], order: AxisOrder, given: Option<Shape>) -> Result<Shape, String> {
-    let said = steps.iter().find_map(|step| step.input.as_ref());
+fn input_shape(said: Option<&Vec<usize>>, order: AxisOrder, given: Option<Shape>) -> Result<Shape, String> {
     let shape = match said.map(Vec::as_slice) {
         Some(&[a, b, c]) if a > 0 && b > 0 && c > 0 => match order {
             AxisOrder::ChannelsLast => Shape::new(c, a, b),

@@ -64,6 +64,11 @@ pub(super) enum Operation {
     GlobalPool {
         max: bool,
     },
+    /// Height and width, by picking or averaging pixels.
+    Shrink {
+        to: [usize; 2],
+        linear: bool,
+    },
     Flatten,
 }
 
@@ -169,6 +174,26 @@ pub(super) fn translate(layer: &KerasLayer, known: Option<LambdaAffine>) -> Resu
             notice = Some("acts in training only, and is left out");
             Operation::Nothing
         }
+        class if RANDOM.contains(&class) => {
+            notice =
+                Some("changes pictures in training only, and is left out; `augmentation` of a recipe does such things");
+            Operation::Nothing
+        }
+        "Resizing" => {
+            for name in ["crop_to_aspect_ratio", "pad_to_aspect_ratio", "antialias"] {
+                if options.flag(&[name], false)? {
+                    return Err(format!("`{name}` has no counterpart"));
+                }
+            }
+            let linear = match options.find(&["interpolation"]).map_or(Some("bilinear"), |(_, value)| value.as_str()) {
+                Some("bilinear") => true,
+                Some("nearest") => false,
+                other => {
+                    return Err(format!("interpolation `{}` has no counterpart", shown(other.unwrap_or("unknown"))));
+                }
+            };
+            Operation::Shrink { to: [options.size(&["height"])?, options.size(&["width"])?], linear }
+        }
         "Activation" => {
             activation = options.activation()?;
             Operation::Nothing
@@ -180,6 +205,28 @@ pub(super) fn translate(layer: &KerasLayer, known: Option<LambdaAffine>) -> Resu
     };
     Ok(KerasStep { operation, activation, order: options.order()?, input: options.input()?, notice })
 }
+
+/// Layers that change pictures at random in training, and leave them alone else.
+const RANDOM: [&str; 18] = [
+    "RandomBrightness",
+    "RandomColorDegeneration",
+    "RandomColorJitter",
+    "RandomContrast",
+    "RandomElasticTransform",
+    "RandomErasing",
+    "RandomFlip",
+    "RandomGaussianBlur",
+    "RandomGrayscale",
+    "RandomHue",
+    "RandomInvert",
+    "RandomPerspective",
+    "RandomRotation",
+    "RandomSaturation",
+    "RandomSharpness",
+    "RandomShear",
+    "RandomTranslation",
+    "RandomZoom",
+];
 
 /// Why a class cannot be imported.
 fn without_counterpart(class: &str) -> &'static str {
@@ -193,7 +240,7 @@ fn without_counterpart(class: &str) -> &'static str {
         }
         "Reshape" | "Permute" | "RepeatVector" => "moves numbers about in a way that has no counterpart",
         "SeparableConv2D" | "SeparableConvolution2D" | "DepthwiseConv2D" => "separable convolution has no counterpart",
-        "Deconvolution2D" | "Conv2DTranspose" | "UpSampling2D" | "Resizing" => "enlarging a map has no counterpart",
+        "Deconvolution2D" | "Conv2DTranspose" | "UpSampling2D" => "enlarging a map has no counterpart",
         "AtrousConvolution2D" => "a kernel with holes has no counterpart",
         class if class.ends_with("1D") || class.ends_with("3D") => "works on one or three dimensions, not on images",
         _ => "has no counterpart",
