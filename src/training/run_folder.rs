@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use steersman_kernels::conv::ConvAlgorithm;
 
 use super::history::{EpochRecord, history_csv, read_history};
-use super::run::TrainResult;
+use super::request::TrainResult;
 use crate::dataset::Description;
 use crate::error::{Error, Result};
 use crate::files::lock::{LOCK_NAME, Lock};
