@@ -43,7 +43,7 @@
 //! # Ok::<(), steersman::Error>(())
 //! ```
 //!
-//! [`exchange`] writes the same model as ONNX, C or Rust for programs that do not link this crate.
+//! [`exchange`] writes the same model as ONNX, TensorFlow Lite, C or Rust for programs that do not link this crate.
 //!
 //! # Train on a recording of your own
 //!

@@ -9,9 +9,10 @@ use super::{load_model, print, print_json};
 use crate::error::{Error, Result};
 use crate::exchange::onnx::{OPSET, OnnxOptions, onnx};
 use crate::exchange::source::{Language, source};
+use crate::exchange::tflite::tflite;
 use crate::files::atomic_file;
 
-/// Write a model as an ONNX file, or as C or Rust source code that needs nothing else
+/// Write a model as an ONNX file, as a TensorFlow Lite file, or as C or Rust source code that needs nothing else
 #[derive(Debug, Args)]
 pub struct ExportArgs {
     /// Model file
@@ -21,12 +22,15 @@ pub struct ExportArgs {
     to: Format,
     /// File to write
     file: PathBuf,
-    /// ONNX: take the camera image (uint8, RGB) instead of the preprocessed picture. C and Rust always do
+    /// ONNX: take the camera image (uint8, RGB) instead of the preprocessed picture. The others always do
     #[arg(long)]
     with_preprocessing: bool,
-    /// ONNX: merge batch normalisation into the layer before it. C and Rust always do
+    /// ONNX: merge batch normalisation into the layer before it. The others always do
     #[arg(long)]
     fold_batch_norm: bool,
+    /// TensorFlow Lite: the constant throttle of a model that gives none, from -1 to 1
+    #[arg(long, value_name = "VALUE", allow_hyphen_values = true)]
+    throttle: Option<f32>,
     /// Overwrite FILE if it exists
     #[arg(long)]
     force: bool,
@@ -43,6 +47,8 @@ enum Format {
     C,
     /// Rust, one module with a type `Model`; no std needed
     Rust,
+    /// TensorFlow Lite, a pilot for donkeycar (type `tflite_linear`)
+    Tflite,
 }
 
 #[derive(Serialize)]
@@ -61,6 +67,15 @@ pub fn run(args: ExportArgs) -> Result<()> {
             args.file.display()
         )));
     }
+    if args.throttle.is_some() && !matches!(args.to, Format::Tflite) {
+        return Err(Error::Usage("--throttle goes with --to tflite only".into()));
+    }
+    if matches!(args.to, Format::Tflite) && args.file.extension().is_none_or(|extension| extension != "tflite") {
+        return Err(Error::Usage(format!(
+            "{}: donkeycar loads files whose names end with .tflite: give such a name",
+            args.file.display()
+        )));
+    }
     let model = load_model(&args.model)?;
     if same_file(&args.model, &args.file) {
         return Err(Error::Usage(format!(
@@ -76,6 +91,7 @@ pub fn run(args: ExportArgs) -> Result<()> {
         }
         Format::C => (source(&model, Language::C)?.into_bytes(), "C99".into()),
         Format::Rust => (source(&model, Language::Rust)?.into_bytes(), "Rust".into()),
+        Format::Tflite => (tflite(&model, args.throttle)?, "TensorFlow Lite, float32".into()),
     };
     atomic_file::write(&args.file, &bytes)?;
     let [height, width] = model.recipe.preprocessing.source;
@@ -86,6 +102,10 @@ pub fn run(args: ExportArgs) -> Result<()> {
     }
     let [a, b, c] = input;
     let takes = match with_preprocessing {
+        true if matches!(args.to, Format::Tflite) => format!(
+            "RGB images of {b}x{a} pixels divided by 255, [1][{a}][{b}][{c}]; for donkeycar set IMAGE_W = {b}, IMAGE_H = {a} \
+             and drive with --type tflite_linear"
+        ),
         true => format!("RGB images of {b}x{a} pixels, 8 bits, [{a}][{b}][{c}]"),
         false => format!("preprocessed pictures [{a}][{b}][{c}]; --with-preprocessing makes it take camera images"),
     };
