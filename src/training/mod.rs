@@ -31,5 +31,5 @@ pub(crate) use data::Data;
 pub use history::{EpochRecord, read_history};
 pub use profile::ProfileReport;
 pub use run::{TrainRequest, TrainResult, TrainingEvent, resume, resume_with, train};
-pub(crate) use run_folder::{RunFolder, RunInfo};
+pub(crate) use run_folder::{NewRun, RunFolder, RunInfo};
 pub use transfer::TransferRequest;
