@@ -43,7 +43,7 @@
 //! # Ok::<(), steersman::Error>(())
 //! ```
 //!
-//! [`exchange`] writes the same model as ONNX, C or Rust for programs that do not link this crate.
+//! [`exchange`] writes the same model as ONNX, TensorFlow Lite, C or Rust for programs that do not link this crate.
 //!
 //! # Train on a recording of your own
 //!
@@ -69,7 +69,7 @@
 //! let mut observer = |event| {
 //!     match event {
 //!         TrainingEvent::Notice(text) => println!("{text}"),
-//!         TrainingEvent::Batch { .. } => {}
+//!         TrainingEvent::Begin { .. } | TrainingEvent::Batch { .. } => {}
 //!         TrainingEvent::Epoch { record, of } => println!("epoch {} of {of}: loss {:.4}", record.epoch, record.train_loss),
 //!     }
 //!     Ok(())
@@ -191,7 +191,7 @@ pub mod main_job;
 pub mod metrics;
 #[cfg(feature = "training")]
 pub mod model_file;
-#[cfg(any(feature = "live", feature = "serve"))]
+#[cfg(feature = "serve")]
 mod net;
 #[cfg(feature = "training")]
 pub mod observer;

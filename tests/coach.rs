@@ -164,23 +164,15 @@ fn a_person_marks_undoes_reloads_and_training_obeys() {
     browser.wait_for("document.getElementById('counts').textContent === '120 rows, 1 row left out (0.8 %)'");
     // Nothing lies beside a phone's screen, in the dark as in the light.
     for scheme in ["light", "dark"] {
-        let features = json!({ "features": [{ "name": "prefers-color-scheme", "value": scheme }] });
-        browser.tell("Emulation.setEmulatedMedia", features);
+        browser.prefer(scheme);
         for size in [[390, 844], [1300, 900]] {
             browser.resize(size);
             browser.wait_for(&format!("innerWidth === {}", size[0]));
-            let fits = "document.documentElement.scrollWidth <= document.documentElement.clientWidth";
-            assert_eq!(browser.value(fits), true, "{scheme}, {size:?}");
+            browser.assert_no_sideways_scrolling(&format!("{scheme}, {size:?}"));
             let small = "[...document.querySelectorAll('button, select')].filter(e => e.offsetParent \
                 && e.getBoundingClientRect().height < 24).map(e => e.outerHTML)";
             assert_eq!(browser.value(small), json!([]), "{scheme}");
-            let pale = "(() => { const light = text => { const [r, g, b] = text.match(/[0-9.]+/g).map(v => v / 255)\
-                .map(v => v <= .04045 ? v / 12.92 : ((v + .055) / 1.055) ** 2.4); return .2126 * r + .7152 * g + .0722 * b; };\
-                const paper = light(getComputedStyle(document.body).backgroundColor);\
-                return [...document.querySelectorAll('h1, h2, span, figcaption, .help, #values b, .none')]\
-                .filter(e => e.offsetParent && e.textContent.trim()).map(e => [light(getComputedStyle(e).color), e.outerHTML])\
-                .filter(([ink]) => (Math.max(ink, paper) + .05) / (Math.min(ink, paper) + .05) < 4.5).map(([, html]) => html); })()";
-            assert_eq!(browser.value(pale), json!([]), "contrast, {scheme}");
+            browser.assert_contrast("h1, h2, span, figcaption, .help, #values b, .none", scheme);
         }
     }
     assert!(browser.complaints.is_empty(), "{:?}", browser.complaints);

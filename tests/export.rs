@@ -1,4 +1,4 @@
-//! Exported models compute what the engine computes: as C, as Rust, and in ONNX Runtime.
+//! Exported models compute what the engine computes: as C, as Rust, in ONNX Runtime, and in donkeycar.
 
 mod common;
 
@@ -303,45 +303,95 @@ fn main() {
 }
 "#;
 
-/// A Python with what `tests/exchange/check_onnx.py` needs, or a printed reason.
-fn python() -> Option<PathBuf> {
-    let given = std::env::var_os("STEERSMAN_PYTHON").map(PathBuf::from);
+/// The Python that `variable` names, or `python3`, if it has the modules of `imports`; or a printed reason.
+fn python(variable: &str, imports: &str, requirements: &str) -> Option<PathBuf> {
+    let given = std::env::var_os(variable).map(PathBuf::from);
     let python = given.clone().unwrap_or("python3".into());
-    let output = Command::new(&python).args(["-c", "import numpy, onnx, onnxruntime, PIL"]).output();
+    let output = Command::new(&python).args(["-c", imports]).output();
     let reason = match output {
         Ok(output) if output.status.success() => return Some(python),
         Ok(output) => String::from_utf8_lossy(&output.stderr).lines().last().unwrap_or_default().to_string(),
         Err(error) => error.to_string(),
     };
-    assert!(given.is_none(), "STEERSMAN_PYTHON: {}: {reason}", python.display());
-    eprintln!("skipped: {}: {reason} (see tests/exchange/requirements.txt)", python.display());
+    assert!(given.is_none(), "{variable}: {}: {reason}", python.display());
+    eprintln!("skipped: {}: {reason} (see tests/exchange/{requirements})", python.display());
     None
 }
 
-#[test]
-fn onnx_files_pass_the_checker_and_agree_in_onnx_runtime() {
-    let Some(python) = python() else { return };
+/// Runs a script of `tests/exchange` on every recipe, every layer and every preprocessing, `others` included; each of its lines
+/// that end with `ok` is one form of a model, of which there are `forms`.
+fn check_with(python: &Path, script: &str, recording: &str, others: &[Recipe], forms: usize) {
     let folder = tempfile::tempdir().unwrap();
     let mut models = Vec::new();
     let named = two_outputs().map(|recipe| Recipe { name: format!("{}-two-outputs", recipe.name), ..recipe });
     let one = ["hyper", "hyper-prelu", "lenet", "pilotnet", "default"].map(shipped).into_iter().chain(every_layer());
-    for recipe in one.chain(named) {
+    for recipe in one.chain(named).chain(others.iter().cloned()) {
         let path = folder.path().join(format!("{}.safetensors", recipe.name));
         model(recipe).save(&path).unwrap();
         models.push(path);
     }
     let checkout = Path::new(env!("CARGO_MANIFEST_DIR"));
     let sample = checkout.join("data/sample");
-    let recording =
-        std::env::var_os("STEERSMAN_RECORDINGS").map_or(sample, |path| Path::new(&path).join("lake-sample"));
+    let recording = std::env::var_os("STEERSMAN_RECORDINGS").map_or(sample, |path| Path::new(&path).join(recording));
     let mut command = Command::new(python);
-    command.arg(checkout.join("tests/exchange/check_onnx.py"));
+    command.arg(checkout.join("tests/exchange").join(script));
     command.args(["--rows", "100", "--steersman", env!("CARGO_BIN_EXE_steersman")]);
     let output = command.arg(recording).args(&models).output().unwrap();
     let table = String::from_utf8_lossy(&output.stdout);
     println!("{table}");
     assert!(output.status.success(), "{table}{}", String::from_utf8_lossy(&output.stderr));
-    assert_eq!(table.lines().filter(|line| line.ends_with("ok")).count(), 4 * models.len(), "{table}");
+    assert_eq!(table.lines().filter(|line| line.ends_with("ok")).count(), forms * models.len(), "{table}");
+}
+
+#[test]
+fn onnx_files_pass_the_checker_and_agree_in_onnx_runtime() {
+    let imports = "import numpy, onnx, onnxruntime, PIL";
+    let Some(python) = python("STEERSMAN_PYTHON", imports, "requirements.txt") else { return };
+    check_with(&python, "check_onnx.py", "lake-sample", &[shipped("donkey")], 4);
+}
+
+#[test]
+fn donkeycar_drives_with_tflite_files_as_the_engine_does() {
+    let imports = "import ai_edge_litert, donkeycar, PIL";
+    let Some(python) = python("STEERSMAN_DONKEYCAR_PYTHON", imports, "requirements-donkeycar.txt") else { return };
+    check_with(&python, "check_tflite.py", "donkey-tub", &[shipped("donkey")], 1);
+}
+
+#[test]
+fn a_pilot_for_donkeycar_has_exactly_one_throttle() {
+    let folder = tempfile::tempdir().unwrap();
+    let dir = folder.path();
+    model(shipped("lenet")).save(&dir.join("steers")).unwrap();
+    for recipe in two_outputs() {
+        model(recipe.clone()).save(&dir.join(recipe.outputs.specs()[1].name.name())).unwrap();
+    }
+    let export = |model: &'static str, rest: &[&'static str]| {
+        [&["export", model, "pilot.tflite", "--to", "tflite", "--force"], rest].concat()
+    };
+    let constant = ["--throttle", "-0.25"];
+    for (model, rest, message) in [
+        ("steers", &[][..], "--throttle VALUE drives at a constant one"),
+        ("speed", &[], "--throttle VALUE leaves the speed out"),
+        ("throttle", &constant, "gives its own throttle"),
+        ("steers", &["--throttle", "1.5"], "from -1 to 1"),
+        ("steers", &["--throttle", "nan"], "from -1 to 1"),
+    ] {
+        let error = error(dir, &export(model, rest));
+        assert!(error.contains(message), "{model}: {error}");
+    }
+    assert!(error(dir, &["export", "steers", "pilot", "--to", "tflite"]).contains("end with .tflite"));
+    assert!(error(dir, &["export", "steers", "a.c", "--to", "c", "--throttle", "0.1"]).contains("--to tflite only"));
+    assert!(!dir.join("pilot.tflite").exists());
+    for (model, rest) in [("steers", &constant[..]), ("speed", &constant), ("throttle", &[])] {
+        run(dir, &export(model, rest));
+        let bytes = fs::read(dir.join("pilot.tflite")).unwrap();
+        assert_eq!(&bytes[4..8], b"TFL3");
+        assert!(bytes.len().is_multiple_of(16), "constants lie at multiples of 16 bytes");
+        // Steering and throttle are the names in their order that donkeycar sorts them by.
+        for name in ["serving_default", "serving_default_img_in:0", "img_in", "n_outputs0", "n_outputs1"] {
+            assert!(bytes.windows(name.len()).any(|window| window == name.as_bytes()), "{model}: {name}");
+        }
+    }
 }
 
 #[test]
@@ -372,5 +422,5 @@ fn a_file_that_exists_is_kept_and_bad_input_says_what_to_do() {
         common::command::steersman(dir).args(["export", "model.safetensors", "x", "--to", "java"]).output().unwrap();
     let message = String::from_utf8(output.stderr).unwrap();
     assert_eq!(output.status.code(), Some(2));
-    assert!(message.contains("[possible values: onnx, c, rust]"), "{message}");
+    assert!(message.contains("[possible values: onnx, c, rust, tflite]"), "{message}");
 }

@@ -8,8 +8,9 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use common::command::{error, json};
+use common::double::SILENCE;
 use common::page::{Page, serve};
-use common::served::{Served, random_model};
+use common::served::{Client, Served, command, random_model, sample_jpeg, telemetry};
 use serde_json::{Value, json};
 use steersman::dataset;
 use steersman::picture::{RgbImage, decode::decode_rgb};
@@ -250,17 +251,37 @@ fn a_drive_is_watched_in_real_time_by_several_and_ends_with_ctrl_c() {
         skipped.number("trail_id") > last.number("trail_id") || skipped.number("time_s") >= last.number("time_s") - 0.2
     );
 
-    // Commands of a watching page mean nothing.
+    // Whoever watches can let time stand still, and see that.
+    page.ask(&json!({ "type": "pause" }));
+    let paused = loop {
+        let frame = page.next().unwrap();
+        if frame.state["playback"]["paused"] == true {
+            break frame;
+        }
+    };
+    std::thread::sleep(Duration::from_millis(300));
+    page.ask(&json!({ "type": "rate", "rate": 4 }));
+    let still = page.next().unwrap();
+    assert_eq!((&still.state["time_s"], &still.state["playback"]["rate"]), (&paused.state["time_s"], &json!(4.0)));
+    page.ask(&json!({ "type": "pause" }));
+    // To the end of the run, whose result stands on the page.
+    page.ask(&json!({ "type": "next_run" }));
+    let after = loop {
+        let frame = page.next().unwrap();
+        if frame.state["trail_id"] != paused.state["trail_id"] {
+            break frame;
+        }
+    };
+    let result = &after.state["results"][0];
+    assert!(paused.state["title"].as_str().unwrap().ends_with(result["run"].as_str().unwrap()), "{result}");
+    assert!(result["time_s"].as_f64() > paused.state["time_s"].as_f64());
+    // Commands of a driver mean nothing from a watching page.
     page.ask(&json!({ "type": "finish" }));
     page.press(1, 1);
-    // A random network leaves the road; then the same run is driven with help, on a clean map.
-    let began = Instant::now();
-    while page.next().unwrap().state["trail_id"] == first.state["trail_id"] {
-        assert!(began.elapsed() < common::double::SILENCE);
-    }
     std::thread::sleep(Duration::from_secs(1));
     let late = Page::open(served.port);
     assert!(!late.hello["trail"].as_array().unwrap().is_empty(), "who comes late sees the trail so far");
+    assert!(late.hello["recent"].as_array().unwrap().len() > 3, "and the charts");
     drop((late, slow));
     served.interrupt();
     let words = loop {
@@ -307,4 +328,106 @@ fn idle_connections_make_room_and_a_page_in_use_keeps_its_seat() {
     );
     served.interrupt();
     assert_eq!(served.code(), Some(130));
+}
+
+#[test]
+fn beside_a_server_keys_take_the_wheel_from_the_model_and_the_rows_are_marked() {
+    let folder = tempfile::tempdir().unwrap();
+    let dir = folder.path();
+    random_model(&dir.join("model"), "lenet");
+    let served = Served::start(dir, "model", &["--page=0", "--record", "corrections"]);
+    let said = served.wait_until_it_says("in a browser to take the wheel");
+    let port = said.split("open http://127.0.0.1:").nth(1).unwrap().split('/').next().unwrap().parse().unwrap();
+    let mut car = served.connect_simulator();
+    let jpeg = sample_jpeg();
+    let turn = |car: &mut Client| {
+        car.send(&telemetry(10.0, &jpeg));
+        command(&car.next())
+    };
+    let (of_model, throttle) = turn(&mut car);
+    assert!(throttle > 0.0 && of_model < 0.9, "{of_model} {throttle}");
+    let mut page = Page::open(port);
+    assert_eq!(turn(&mut car).0, of_model, "a page that is only open does not drive");
+    let frame = page.next().unwrap();
+    assert_eq!(frame.camera, jpeg);
+    assert_eq!(frame.state["takeover"]["by_user"], false);
+    // A held key turns the wheel to full lock, while the server holds the speed.
+    let began = Instant::now();
+    let mut driven = (of_model, 0.0);
+    while driven.0 < 1.0 {
+        assert!(began.elapsed() < SILENCE, "{driven:?}");
+        page.press(1, 0);
+        std::thread::sleep(Duration::from_millis(20));
+        driven = turn(&mut car);
+    }
+    assert!(driven.1 > 0.0, "{driven:?}");
+    let state = loop {
+        let state = page.next().unwrap().state;
+        if state["steering"] == 1.0 {
+            break state;
+        }
+    };
+    assert_eq!(state["takeover"]["by_user"], true);
+    assert!((state["expert"].as_f64().unwrap() - of_model).abs() < 1e-6, "the model is asked all the time: {state}");
+    assert!(state["takeover"]["rows"].as_u64().unwrap() > 0, "{state}");
+    // Whoever lets go gives the wheel back, and a page that leaves does so at once.
+    while turn(&mut car).0 != of_model {
+        assert!(began.elapsed() < SILENCE);
+        page.press(0, 0);
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    page.press(1, 0);
+    while turn(&mut car).0 == of_model {
+        assert!(began.elapsed() < SILENCE);
+    }
+    page.ask(&json!({ "type": "leave" }));
+    while turn(&mut car).0 != of_model {
+        assert!(began.elapsed() < SILENCE);
+    }
+    served.interrupt();
+    let words = loop {
+        if let Err(words) = page.next() {
+            break words;
+        }
+    };
+    assert!(words.contains("of them by you"), "{words}");
+    let (summary, said) = served.end();
+    assert!(said.contains("driven from the page"), "{said}");
+    let by_user = summary["recorded"]["by_user"].as_u64().unwrap();
+    let log = std::fs::read_to_string(dir.join("corrections/driving_log.csv")).unwrap();
+    assert_eq!(log.lines().filter(|line| line.ends_with(", user")).count() as u64, by_user);
+    assert!(by_user > 0 && log.contains(", pilot"), "{log}");
+}
+
+#[test]
+fn a_training_is_watched_and_its_page_ends_with_the_report_that_is_on_disk() {
+    let folder = tempfile::tempdir().unwrap();
+    let sample = Path::new(env!("CARGO_MANIFEST_DIR")).join("data/sample");
+    let args = ["train", sample.to_str().unwrap(), "--recipe", "lenet", "--set", "epochs=4", "--out", "run", "--watch"];
+    let served = serve(folder.path(), &[&args[..], &["--json"]].concat());
+    let get = |path: &str, host: &str| served.ask(&format!("GET {path} HTTP/1.1\r\nHost: {host}\r\n\r\n"));
+    let own = format!("127.0.0.1:{}", served.port);
+    for (path, host, status) in [("/", "evil.example", "403"), ("/x", &own[..], "404"), ("/", &own, "200")] {
+        assert!(get(path, host).starts_with(&format!("HTTP/1.1 {status}")), "{path} {host}");
+    }
+    let state = || -> Value { serde_json::from_str(get("/state", &own).split("\r\n\r\n").nth(1).unwrap()).unwrap() };
+    let (began, mut reports) = (Instant::now(), Vec::new());
+    let last = loop {
+        let state = state();
+        let number = state["report"].as_u64().unwrap();
+        if number > 0 && reports.last().is_none_or(|(last, _)| *last < number) {
+            let page = get("/report", &own).split_once("\r\n\r\n").unwrap().1.to_string();
+            reports.push((number, page));
+        }
+        if !state["over"].is_null() {
+            break state;
+        }
+        assert!(began.elapsed() < SILENCE, "{state}");
+        std::thread::sleep(Duration::from_millis(20));
+    };
+    let (result, _) = served.end();
+    assert!(last["over"].as_str().unwrap().contains(result["model"].as_str().unwrap()), "{last}");
+    assert_eq!((&last["run"], &last["epoch"], &last["epochs"]), (&json!("run"), &json!(4), &json!(4)));
+    let (_, page) = reports.last().unwrap();
+    assert_eq!(*page, fs::read_to_string(folder.path().join("run/report.html")).unwrap());
 }

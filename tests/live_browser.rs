@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use common::browser::Browser;
 use common::command::json;
 use common::page::serve;
-use common::served::random_model;
+use common::served::{Served, command, random_model, sample_jpeg, telemetry};
 use serde_json::json;
 
 /// Fails if something does not fit into the window, or is cut off.
@@ -127,6 +127,24 @@ fn a_drive_is_watched_with_its_saliency() {
     }
     let time = browser.value("state.time_s + 100 * state.trail_id").as_f64().unwrap();
     browser.wait_for(&format!("state.time_s + 100 * state.trail_id > {time} + 0.5"));
+    browser.key("Space", true);
+    browser.key("Space", false);
+    browser.wait_for("document.getElementById('rate').textContent === 'paused'");
+    let [x, y] = browser.middle("next");
+    browser.mouse("mousePressed", x, y);
+    browser.mouse("mouseReleased", x, y);
+    browser.wait_for(
+        "!document.getElementById('finished').hidden && document.querySelector('#results td').textContent !== ''",
+    );
+    browser.key("NumpadAdd", true);
+    browser.wait_for("document.getElementById('rate').textContent === '2 times real time'");
+    browser.key("NumpadAdd", false);
+    for size in [[1600, 900], [1024, 768]] {
+        assert_fits(&mut browser, size);
+    }
+    browser.wait_for("history.length > 20");
+    browser.reload();
+    browser.wait_for("typeof history !== 'undefined' && state !== null && history.length > 10");
     assert!(browser.complaints.is_empty(), "{:?}", browser.complaints);
     // The browser stays; the page says that the drive is over.
     served.interrupt();
@@ -141,17 +159,9 @@ fn a_phone_in_the_dark_drives_with_a_finger_on_each_pedal() {
     let Some(mut browser) = Browser::open(&format!("http://127.0.0.1:{}/", served.port), [390, 844]) else { return };
     browser.wait_for("document.getElementById('link')?.textContent === 'you drive'");
     for scheme in ["light", "dark"] {
-        let features = json!({ "features": [{ "name": "prefers-color-scheme", "value": scheme }] });
-        browser.tell("Emulation.setEmulatedMedia", features);
-        let fits = "document.documentElement.scrollWidth <= document.documentElement.clientWidth";
-        assert_eq!(browser.value(fits), true, "{scheme}");
-        let pale = "(() => { const light = text => { const [r, g, b] = text.match(/[0-9.]+/g).map(v => v / 255)\
-            .map(v => v <= .04045 ? v / 12.92 : ((v + .055) / 1.055) ** 2.4); return .2126 * r + .7152 * g + .0722 * b; };\
-            const paper = light(getComputedStyle(document.body).backgroundColor);\
-            return [...document.querySelectorAll('h1, p, figcaption, .gauge, #subject, #link')]\
-            .filter(e => e.offsetParent && e.textContent.trim()).map(e => [light(getComputedStyle(e).color), e.outerHTML])\
-            .filter(([ink]) => (Math.max(ink, paper) + .05) / (Math.min(ink, paper) + .05) < 4.5).map(([, html]) => html); })()";
-        assert_eq!(browser.value(pale), json!([]), "contrast, {scheme}");
+        browser.prefer(scheme);
+        browser.assert_no_sideways_scrolling(scheme);
+        browser.assert_contrast("h1, p, figcaption, .gauge, #subject, #link", scheme);
     }
     assert!(browser.colours("map") > 4 && browser.colours("chart") > 4);
     let [x, y] = browser.middle("accelerate");
@@ -165,4 +175,80 @@ fn a_phone_in_the_dark_drives_with_a_finger_on_each_pedal() {
     browser.mouse("mouseReleased", x, y);
     assert!(browser.complaints.is_empty(), "{:?}", browser.complaints);
     served.stop();
+}
+
+#[test]
+fn beside_a_server_the_arrow_keys_take_the_wheel() {
+    let folder = tempfile::tempdir().unwrap();
+    random_model(&folder.path().join("model"), "lenet");
+    let served = Served::start(folder.path(), "model", &["--page=0", "--record", "corrections"]);
+    let said = served.wait_until_it_says("in a browser to take the wheel");
+    let url = said.lines().find_map(|line| line.strip_prefix("open ")?.split(' ').next()).unwrap().to_string();
+    let Some(mut browser) = Browser::open(&url, [1024, 768]) else { return };
+    browser.wait_for("document.getElementById('link')?.textContent === 'connected'");
+    let mut car = served.connect_simulator();
+    let jpeg = sample_jpeg();
+    let mut turn = || {
+        car.send(&telemetry(10.0, &jpeg));
+        command(&car.next()).0
+    };
+    let of_model = turn();
+    browser.wait_for("document.getElementById('who').textContent === 'the model drives' && history.length > 0");
+    assert!(browser.colours("camera") > 50);
+    for (size, scheme) in [([1600, 900], "light"), ([1024, 768], "dark"), ([390, 844], "dark")] {
+        browser.prefer(scheme);
+        browser.resize(size);
+        browser.wait_for(&format!("innerWidth === {}", size[0]));
+        browser.assert_no_sideways_scrolling(&format!("{scheme}, {size:?}"));
+        browser.assert_contrast("h1, p, figcaption, .gauge, #subject, #link, #who", scheme);
+        turn();
+    }
+    browser.key("ArrowRight", true);
+    let began = Instant::now();
+    while turn() < 1.0 {
+        assert!(began.elapsed() < Duration::from_secs(60));
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    browser.wait_for("document.getElementById('who').textContent === 'you drive'");
+    browser.key("ArrowRight", false);
+    while turn() != of_model {
+        assert!(began.elapsed() < Duration::from_secs(60));
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    browser.wait_for("document.getElementById('who').textContent === 'the model drives'");
+    browser.wait_for("/Recorded with your steering: [1-9]/.test(document.getElementById('corrected').textContent)");
+    assert!(browser.complaints.is_empty(), "{:?}", browser.complaints);
+    served.stop();
+    browser.wait_for("document.getElementById('over').textContent.includes('of them by you')");
+}
+
+#[test]
+fn a_training_shows_its_report_while_it_runs_and_says_at_the_end_how_to_go_on() {
+    let folder = tempfile::tempdir().unwrap();
+    let sample = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("data/sample");
+    let args =
+        ["train", sample.to_str().unwrap(), "--recipe", "lenet", "--set", "epochs=10000", "--out", "run", "--watch"];
+    let served = serve(folder.path(), &args);
+    let Some(mut browser) = Browser::open(&format!("http://127.0.0.1:{}/", served.port), [1280, 900]) else { return };
+    let inside = "document.getElementById('report').contentDocument";
+    browser.wait_for(&format!(
+        "typeof shown !== 'undefined' && shown > 1 && {inside}?.body?.textContent.includes('The worst frames')"
+    ));
+    browser.wait_for("/epoch \\d+\\/10000, .* images\\/s, .* left/.test(document.getElementById('doing').textContent)");
+    let errors = browser.value(&format!("{inside}.querySelectorAll('svg').length > 2"));
+    assert_eq!(errors, true, "the curves are drawn");
+    for (size, scheme) in [([1280, 900], "light"), ([1280, 900], "dark"), ([390, 844], "dark")] {
+        browser.prefer(scheme);
+        browser.resize(size);
+        browser.wait_for(&format!("innerWidth === {}", size[0]));
+        browser.assert_no_sideways_scrolling(&format!("{scheme}, {size:?}"));
+        let fits = format!("{inside}.documentElement.scrollWidth <= {inside}.documentElement.clientWidth");
+        browser.wait_for(&format!("{inside}?.readyState === 'complete' && {fits}"));
+        browser.assert_contrast("h1, #doing, #link, summary", scheme);
+    }
+    served.interrupt();
+    browser.wait_for("document.getElementById('over').textContent.includes('--resume run')");
+    browser.wait_for(&format!("{inside}?.body?.textContent.includes('This run was stopped after')"));
+    assert!(browser.complaints.is_empty(), "{:?}", browser.complaints);
+    assert_eq!(served.code(), Some(130));
 }

@@ -11,6 +11,7 @@ use super::replay::{self, ReplayArgs};
 use super::share_bar::ShareBar;
 use super::throttle::Throttle;
 use super::video::tell_video;
+use super::words::counted;
 use super::{load_pilot, pool, print, print_json, stop_on_ctrl_c};
 use crate::dataset::held_out::trained_on_held_out;
 use crate::error::{Error, Result};
@@ -24,11 +25,11 @@ use crate::report::pages::sweep::Swept;
 use crate::report::video::drive::DriveVideo;
 use crate::report::video::onlooker::Onlooker;
 use crate::report::video::painter::Captions;
-use crate::simulator::trial::drive::drive;
 use crate::simulator::trial::statistics::PairedTest;
 use crate::simulator::trial::trajectory::write_trajectories;
 use crate::simulator::{
-    DriveOptions, DriveResult, DriveSummary, Driver, Expert, Speed, Track, Zero, compare, drive_observed,
+    DriveOptions, DriveResult, DriveSummary, Driver, Expert, Speed, Track, Zero, compare, drive_as_far,
+    drive_observed_as_far,
 };
 
 /// Let a model drive in the simulator and measure how well
@@ -177,17 +178,33 @@ pub fn run(args: DriveArgs) -> Result<()> {
     }
     let pool = pool(args.threads)?;
     let go = |wheel: &Wheel, name: &str| pool.install(|| wheel.drive(&track, &options, name, live.as_ref(), &stop));
-    let result = go(&at_wheel, &args.model)?;
+    let (result, mut stopped) = go(&at_wheel, &args.model)?;
     let other = match (&against, &args.against) {
-        (Some(wheel), Some(name)) => Some(go(wheel, name)?),
+        (Some(wheel), Some(name)) if !stopped => match go(wheel, name) {
+            Ok((other, false)) => Some(other),
+            Ok((_, true)) | Err(Error::Interrupted) => {
+                stopped = true;
+                None
+            }
+            Err(error) => return Err(error),
+        },
         _ => None,
     };
+    if stopped {
+        let driven = format!("{} of {}", result.trials.len(), counted(options.runs, "run"));
+        let kept = args
+            .out
+            .as_ref()
+            .map_or("add --out DIR to keep what was driven".into(), |out| format!("kept in {}", out.display()));
+        eprintln!("stopped after {driven} of {}; {kept}", args.model);
+    }
     if let Some(live) = live {
         let DriveSummary { laps_completed, laps_total, autonomy_percent, cte_mean_m, .. } = &result.summary;
         live.finish(&format!(
-            "The drive of {} is over: {laps_completed} of {laps_total} laps completed, autonomy {autonomy_percent:.1} %, on average \
+            "The drive of {} is {}: {laps_completed} of {laps_total} laps completed, autonomy {autonomy_percent:.1} %, on average \
              {cte_mean_m:.2} m off the middle.{}",
             args.model,
+            if stopped { "stopped" } else { "over" },
             calm_words(&result.summary)
         ));
     }
@@ -209,7 +226,7 @@ pub fn run(args: DriveArgs) -> Result<()> {
         // The JSON is the last line, so the video comes first; what it ends with must not hide what was measured.
         let filmed = video.map_or(Ok(()), film);
         print_json(&Report { summary: &result.summary, against, comparison })?;
-        return saved.and(filmed);
+        return saved.and(filmed).and(stop_or_ok(stopped));
     }
     let mut text = summary_text(&args.model, &result.summary);
     if let (Some(other), Some(name)) = (&other, &args.against) {
@@ -222,7 +239,12 @@ pub fn run(args: DriveArgs) -> Result<()> {
         }
     }
     print(&text)?;
-    saved.and(video.map_or(Ok(()), film))
+    saved.and(video.map_or(Ok(()), film)).and(stop_or_ok(stopped))
+}
+
+/// The end of a command that was stopped, if it was, after it has told what it has.
+pub(super) fn stop_or_ok(stopped: bool) -> Result<()> {
+    if stopped { Err(Error::Interrupted) } else { Ok(()) }
 }
 
 impl DriveArgs {
@@ -309,9 +331,10 @@ impl Wheel {
         if let Some(path) = &args.video {
             tell_video(path, &summary);
         }
-        if stopped { Err(Error::Interrupted) } else { Ok(()) }
+        stop_or_ok(stopped)
     }
 
+    /// Drives, as far as nobody stops it. Also whether it was stopped.
     pub(super) fn drive(
         &self,
         track: &Track,
@@ -319,19 +342,19 @@ impl Wheel {
         name: &str,
         live: Option<&Live>,
         stop: &StopSignal,
-    ) -> Result<DriveResult> {
+    ) -> Result<(DriveResult, bool)> {
         let new_driver = || Ok(self.driver());
-        let mut result = if let Some(live) = live {
+        let (mut result, stopped) = if let Some(live) = live {
             let pilot = if let Wheel::Model(pilot) = self { Some(&**pilot) } else { None };
-            drive_observed(track, new_driver, options, &mut Watch::new(live, name, pilot, options.runs, stop))?
+            drive_observed_as_far(track, new_driver, options, &mut Watch::new(live, name, pilot, options.runs, stop))?
         } else {
             let mut bar = ShareBar::new(format!("{name} on {}", track.name()), stop);
-            drive(track, new_driver, options, &mut bar)?
+            drive_as_far(track, new_driver, options, &mut bar)?
         };
         if let Wheel::Model(pilot) = self {
             result.summary.trained_on_held_out = pilot.trained_on_held_out().to_vec();
         }
-        Ok(result)
+        Ok((result, stopped))
     }
 }
 
@@ -343,7 +366,7 @@ fn summary_text(model: &str, s: &DriveSummary) -> String {
     };
     let (low, high) = (100.0 * s.completed_low, 100.0 * s.completed_high);
     format!(
-        "{model} on {}{held_out}, {} runs\n{note}\
+        "{model} on {}{held_out}, {}\n{note}\
          laps completed             {}/{} (whole runs: {low:.0} to {high:.0} %, 95 %)\n\
          autonomy                   {:.1} %\n\
          interventions              {} ({:.2} a km)\n\
@@ -355,7 +378,7 @@ fn summary_text(model: &str, s: &DriveSummary) -> String {
          whiteness                  {:.1} deg/s (expert {:.1})\n{}\
          real-time factor           {:.1}\n",
         s.track,
-        s.runs,
+        counted(s.runs, "run"),
         s.laps_completed,
         s.laps_total,
         s.autonomy_percent,

@@ -4,7 +4,8 @@ use std::path::Path;
 
 use serde::Serialize;
 
-use super::drive::{DriveArgs, Wheel};
+use super::drive::{DriveArgs, Wheel, stop_or_ok};
+use super::words::counted;
 use super::{pool, print, print_json, stop_on_ctrl_c};
 use crate::error::{Error, Result};
 use crate::files::new_folder::NewFolder;
@@ -48,7 +49,8 @@ pub fn run(args: &DriveArgs, track: &Track, options: &DriveOptions, swept: Swept
         for (value, options) in &drives {
             let value = *value;
             let name = format!("{driver}, {}", swept.value(value));
-            let result = pool.install(|| wheel.drive(track, options, &name, None, &stop))?;
+            let (result, stopped) = pool.install(|| wheel.drive(track, options, &name, None, &stop))?;
+            stop_or_ok(stopped)?;
             if let Some(folder) = &folder {
                 let name = format!("{}{}", if number == 0 { "" } else { "against-" }, swept.value(value));
                 let of_value = NewFolder::create(&folder.unfinished().join(name.replace(' ', "-")))?;
@@ -111,7 +113,14 @@ fn save(track: &Track, sweeps: &[Sweep], folder: NewFolder) -> Result<()> {
 fn table(track: &Track, runs: usize, sweep: &Sweep) -> String {
     let mut rows: Vec<Vec<String>> = vec![COLUMNS.iter().map(|(header, _)| header.to_string()).collect()];
     rows.extend(sweep.points.iter().map(|point| COLUMNS.iter().map(|(_, cell)| cell(sweep.swept, point)).collect()));
-    format!("{} on {}, {runs} runs each\n{}{}\n", sweep.driver, track.name(), aligned(&rows), sweep.verdict())
+    format!(
+        "{} on {}, {} each\n{}{}\n",
+        sweep.driver,
+        track.name(),
+        counted(runs, "run"),
+        aligned(&rows),
+        sweep.verdict()
+    )
 }
 
 /// `rows` as lines whose columns end below each other; all rows have as many cells as the first.

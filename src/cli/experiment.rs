@@ -8,6 +8,7 @@ use clap::{Args, ValueEnum};
 use super::experiment_replay::{self, ReplayExperimentArgs};
 use super::progress::JobDisplay;
 use super::recording_args::RecordingArgs;
+use super::words::counted;
 use super::{RecipeArgs, or_dash, pool, print_json, refuse_existing, stop_on_ctrl_c};
 use crate::dataset::held_out::{self, trained_on_held_out};
 use crate::error::{Error, Result};
@@ -78,7 +79,7 @@ enum SubjectArg {
     /// RGB, YUV, HSV, the saturation alone, grey
     Colour,
     /// Labels from the recorded wheel, or from the driven path with look-aheads of 0.7, 1.0 and 1.3 s, where keys drove: by default on
-    /// a lap of lake in each direction, with the recipe `recording`; 12 trainings, about 12 minutes on two cores
+    /// a lap of lake in each direction, with the recipe `recording`; 12 trainings, 10 to 20 minutes on two cores
     Labels,
     /// Models of all qualities: does driving on a recording tell how they drive in the simulator?
     Replay,
@@ -236,13 +237,13 @@ fn new_csv(out: Option<PathBuf>, subject: SubjectArg) -> Result<PathBuf> {
 
 fn print_table(plan: &ExperimentPlan, trials: &[ExperimentRow]) {
     println!(
-        "recipe {}, {} epochs, {} recordings; {} trainings of each; driven: {}, {} runs of a lap on each",
+        "recipe {}, {}, {}; {} of each; driven: {}, {} of a lap on each",
         plan.recipe.name,
-        plan.recipe.epochs,
-        plan.recordings.len(),
-        plan.seeds,
+        counted(plan.recipe.epochs as usize, "epoch"),
+        counted(plan.recordings.len(), "recording"),
+        counted(plan.seeds as usize, "training"),
         plan.tracks.join(", "),
-        plan.runs
+        counted(plan.runs, "run")
     );
     println!("                     promised by validation |  delivered on the road");
     println!("variant        leak       MSE       MAE     |  fresh MAE   laps     autonomy       distance from line");

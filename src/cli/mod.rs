@@ -23,7 +23,7 @@ mod evaluate;
 mod experiment;
 mod experiment_replay;
 mod explain;
-mod export;
+pub(crate) mod export;
 mod fit_camera;
 mod import;
 mod inspect;

@@ -1,6 +1,7 @@
 //! How a run shows itself: a bar and live curves on a terminal, plain lines elsewhere.
 
 use std::io::IsTerminal;
+use std::path::Path;
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
@@ -9,10 +10,11 @@ use super::or_dash;
 use super::share_bar::ShareBar;
 use super::words::duration;
 use crate::error::Result;
+use crate::live::training::TrainingPage;
 use crate::main_job::job::JobEvent;
-use crate::observer::{Observer, StopSignal};
+use crate::observer::{Observer, Progress, StopSignal};
 use crate::report::charts::sparkline::sparkline;
-use crate::training::{EpochRecord, TrainingEvent};
+use crate::training::{EpochRecord, Pace, TrainingEvent};
 
 /// Time between plain progress lines.
 const PLAIN_INTERVAL: Duration = Duration::from_secs(10);
@@ -24,17 +26,12 @@ const CURVE: usize = 30;
 /// Shows a training run on standard error.
 pub struct TrainingDisplay {
     bar: Option<ProgressBar>,
-    epoch: u32,
-    epoch_started: Instant,
-    images_before: usize,
+    pace: Pace,
     last_line: Instant,
     /// Losses of the batches of the epoch under way.
     batch_losses: Vec<f64>,
     /// Of the epochs that are done: training and validation loss.
     losses: [Vec<f64>; 2],
-    /// Images a second, and seconds of validation, of the epoch before.
-    last_rate: Option<f64>,
-    validation_s: f64,
 }
 
 impl TrainingDisplay {
@@ -43,17 +40,12 @@ impl TrainingDisplay {
         let style = "epoch {prefix} [{bar:16}] {msg}";
         let style = ProgressStyle::with_template(style).expect("the template is valid").progress_chars("=> ");
         let bar = std::io::stderr().is_terminal().then(|| ProgressBar::new(0).with_style(style));
-        let now = Instant::now();
         TrainingDisplay {
             bar,
-            epoch: 0,
-            epoch_started: now,
-            images_before: 0,
-            last_line: now,
+            pace: Pace::default(),
+            last_line: Instant::now(),
             batch_losses: Vec::new(),
             losses: Default::default(),
-            last_rate: None,
-            validation_s: 0.0,
         }
     }
 
@@ -87,6 +79,7 @@ impl TrainingDisplay {
 impl Observer<TrainingEvent> for TrainingDisplay {
     fn observe(&mut self, event: TrainingEvent) -> Result<()> {
         match event {
+            TrainingEvent::Begin { .. } => {}
             TrainingEvent::Notice(text) => self.print(&text),
             TrainingEvent::Batch { epoch, epochs, images, of, loss } => self.batch([epoch, epochs], images, of, loss),
             TrainingEvent::Epoch { record, of } => self.epoch(&record, of),
@@ -98,8 +91,8 @@ impl Observer<TrainingEvent> for TrainingDisplay {
 impl TrainingDisplay {
     /// A batch of `epoch` of `epochs` is done; `images` of the epoch's `of` images were seen.
     fn batch(&mut self, [epoch, epochs]: [u32; 2], images: usize, of: usize, loss: f64) {
-        if epoch != self.epoch {
-            (self.epoch, self.epoch_started, self.images_before) = (epoch, Instant::now(), images);
+        let now = self.pace.batch([epoch, epochs], [images, of], Instant::now());
+        if now.begins_epoch {
             self.batch_losses.clear();
             if let Some(bar) = &self.bar {
                 bar.set_prefix(format!("{epoch}/{epochs}"));
@@ -107,15 +100,8 @@ impl TrainingDisplay {
                 bar.reset();
             }
         }
-        // Until more than the first batch is done there is no rate but that of the epoch before.
-        let rate = (images - self.images_before) as f64 / self.epoch_started.elapsed().as_secs_f64().max(1e-9);
-        let rate = Some(rate).filter(|rate| *rate > 0.0).or(self.last_rate);
-        let epochs_left = (epochs - epoch) as usize;
-        let validations_s = (epochs_left + 1) as f64 * self.validation_s;
-        let left =
-            rate.map(|rate| duration((of.saturating_sub(images) + epochs_left * of) as f64 / rate + validations_s));
-        let left = left.map_or(String::new(), |left| format!(", {left} left"));
-        let rate = rate.map_or(String::new(), |rate| format!(", {rate:.0} images/s"));
+        let left = now.left_s.map_or(String::new(), |left_s| format!(", {} left", duration(left_s)));
+        let rate = now.images_per_s.map_or(String::new(), |rate| format!(", {rate:.0} images/s"));
         match &self.bar {
             Some(bar) => {
                 self.batch_losses.push(loss);
@@ -135,8 +121,7 @@ impl TrainingDisplay {
     }
 
     fn epoch(&mut self, record: &EpochRecord, of: u32) {
-        self.last_rate = Some(record.images as f64 / record.train_seconds.max(1e-9));
-        self.validation_s = (record.seconds - record.train_seconds).max(0.0);
+        self.pace.epoch(record);
         self.losses[0].push(record.train_loss);
         self.losses[1].extend(record.val_mse);
         if let Some(bar) = &self.bar {
@@ -168,17 +153,30 @@ pub(super) fn beside_steering(throttle_mae: Option<f64>, speed_mae_mph: Option<f
     throttle + &speed
 }
 
-/// Shows a main job on standard error: its training runs, and a bar for each of its other parts.
+/// Shows a main job on standard error: its training runs, and a bar for each of its other parts; with a page, there as well.
 pub struct JobDisplay {
     training: TrainingDisplay,
     bar: Option<ShareBar>,
+    page: Option<TrainingPage>,
     stop: StopSignal,
 }
 
 impl JobDisplay {
     /// For a job that is about to begin, which `stop` ends.
     pub fn new(stop: &StopSignal) -> JobDisplay {
-        JobDisplay { training: TrainingDisplay::new(), bar: None, stop: stop.clone() }
+        JobDisplay { training: TrainingDisplay::new(), bar: None, page: None, stop: stop.clone() }
+    }
+
+    /// The same, that also shows everything on `page`.
+    pub fn with_page(self, page: Option<TrainingPage>) -> JobDisplay {
+        JobDisplay { page, ..self }
+    }
+
+    /// Ends the page with these words; `folder` is that of the run.
+    pub fn close_page(&mut self, words: &str, folder: Option<&Path>) {
+        if let Some(page) = self.page.take() {
+            page.finish(words, folder);
+        }
     }
 
     /// As [`TrainingDisplay::finish`].
@@ -190,6 +188,15 @@ impl JobDisplay {
 
 impl Observer<JobEvent> for JobDisplay {
     fn observe(&mut self, event: JobEvent) -> Result<()> {
+        if let Some(page) = &self.page {
+            match &event {
+                JobEvent::Notice(_) => {}
+                JobEvent::Begin { what } => page.work(Some(what)),
+                JobEvent::Progress(Progress(share)) => page.share(*share),
+                JobEvent::End => page.work(None),
+                JobEvent::Training(event) => page.show(event),
+            }
+        }
         match event {
             JobEvent::Notice(text) => eprintln!("{text}"),
             JobEvent::Begin { what } => self.bar = Some(ShareBar::new(what, &self.stop)),

@@ -11,8 +11,9 @@ use indicatif::{ProgressBar, ProgressStyle};
 use super::throttle::Throttle;
 use super::{load_pilot, or_dash, print_json, stop_on_ctrl_c};
 use crate::error::{Error, Result};
+use crate::live::{self, CoDriverPage};
 use crate::observer::Observer;
-use crate::serve::{HelmOptions, ServeEvent, Server, ServerOptions, Summary};
+use crate::serve::{CoDriver, HelmOptions, ServeEvent, Server, ServerOptions, Summary};
 use crate::text::escaped;
 use crate::udacity;
 
@@ -42,6 +43,10 @@ pub struct ServeArgs {
     /// Record frames and commands in the format of the simulator; the folder must not exist
     #[arg(long, value_name = "DIR")]
     record: Option<PathBuf>,
+    /// Show the drive on a page of this machine, where keys, mouse or gamepad take the wheel from the model; with --record these rows
+    /// are marked as a person's
+    #[arg(long, value_name = "PORT", num_args = 0..=1, require_equals = true)]
+    page: Option<Option<u16>>,
     /// Let web pages of this origin connect, as in http://localhost:8000; may be given several times
     #[arg(long, value_name = "ORIGIN")]
     allow_origin: Vec<String>,
@@ -74,9 +79,16 @@ pub fn run(args: ServeArgs) -> Result<()> {
         allowed_origins: args.allow_origin,
         check: args.check,
     })?;
+    let page = args
+        .page
+        .map(|port| CoDriverPage::start(port.unwrap_or(live::DEFAULT_PORT), args.model.display().to_string()))
+        .transpose()?;
     let stop = stop_on_ctrl_c()?;
     let address = server.address()?;
     say(&format!("listening on ws://{address}/socket.io/"));
+    if let Some(page) = &page {
+        say(&format!("open {} in a browser to take the wheel", page.url()));
+    }
     if args.port != 0 && args.port != udacity::DEFAULT_PORT {
         say(&format!("note: Udacity's simulator connects to port {} by itself", udacity::DEFAULT_PORT));
     }
@@ -84,13 +96,32 @@ pub fn run(args: ServeArgs) -> Result<()> {
         say(&format!("note: whoever reaches {address} can connect; there is no password"));
     }
     let mut screen = Screen::new();
-    let summary = server.run(pilot, &mut screen, &stop)?;
+    let co_driver = page.as_ref().map(|page| page as &dyn CoDriver);
+    let served = server.run(pilot, co_driver, &mut screen, &stop);
     screen.close();
+    if let Some(page) = page {
+        let words = served.as_ref().map_or_else(|error| format!("The server has ended: {error}."), farewell);
+        page.finish(&words);
+    }
+    let summary = served?;
     if args.json {
         return print_json(&summary);
     }
     print_summary(&summary);
     Ok(())
+}
+
+/// The last words on the page.
+fn farewell(summary: &Summary) -> String {
+    match &summary.recorded {
+        Some(recorded) if recorded.rows > 0 => format!(
+            "The server has ended: {} rows are in {}, {} of them by you.",
+            recorded.rows,
+            recorded.folder.display(),
+            recorded.by_user
+        ),
+        _ => format!("The server has ended after {} frames.", summary.frames),
+    }
 }
 
 fn print_summary(summary: &Summary) {

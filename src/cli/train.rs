@@ -16,6 +16,7 @@ use super::words::counted;
 use super::{RecipeArgs, or_dash, pool, print_json, stop_on_ctrl_c};
 use crate::dataset::held_out::{self, trained_on_held_out};
 use crate::error::{Error, Result};
+use crate::live::{self, training::TrainingPage};
 use crate::main_job::dagger_on_log::{self, DaggerNote, Round};
 use crate::main_job::job::{Job, JobEvent, JobNote, JobRequest, RECORDINGS, Scope};
 use crate::main_job::on_recording::judge_run;
@@ -92,6 +93,12 @@ pub struct TrainArgs {
     /// Train on recordings of held-out tracks all the same
     #[arg(long, requires = "recordings")]
     force_held_out: bool,
+    /// Show the training on a page of this machine: how far it is, curves, worst frames; the same report is in the run folder at the end
+    #[arg(long)]
+    watch: bool,
+    /// Port of that page; 0 takes any free one
+    #[arg(long, default_value_t = live::training::DEFAULT_PORT, requires = "watch")]
+    port: u16,
     /// Say at the end where the time went: decoding, forward, backward and so on, and how busy the cores were
     #[arg(long)]
     profile: bool,
@@ -120,6 +127,10 @@ pub fn run(args: TrainArgs) -> Result<()> {
     }
     let stop = stop_on_ctrl_c()?;
     let pool = pool(args.threads)?;
+    let page = args.watch.then(|| TrainingPage::start(args.port)).transpose()?;
+    if let Some(page) = &page {
+        eprintln!("open {} in a browser", page.url());
+    }
     let from = args.from.as_deref().map(model_file).transpose()?;
     let from = from.map(|model| TransferRequest { model, freeze: args.freeze });
     let recipe = || match &from {
@@ -133,7 +144,7 @@ pub fn run(args: TrainArgs) -> Result<()> {
         None => None,
     };
     if let Some(note) = note {
-        let mut display = JobDisplay::new(&stop);
+        let mut display = JobDisplay::new(&stop).with_page(page);
         let scope = Scope::default();
         let mut job = Job::new(scope.clone(), note, &mut display, &stop).with_profile(args.profile);
         let result = match args.resume {
@@ -152,10 +163,13 @@ pub fn run(args: TrainArgs) -> Result<()> {
         drop(job);
         // The bar would take the lines below it along.
         display.finish();
-        let result = pool.install(|| explain_stop(result, folder.as_deref()))?;
-        if let Some(folder) = folder {
-            pool.install(|| write_report(&folder));
+        let result = pool.install(|| explain_stop(result, folder.as_deref()));
+        if let (Ok(_), Some(folder)) = (&result, &folder) {
+            pool.install(|| write_report(folder));
         }
+        let words = last_words(result.as_ref().map(|result| &result.training), folder.as_deref());
+        display.close_page(&words, folder.as_deref());
+        let result = result?;
         if args.json {
             return print_json(&result);
         }
@@ -168,7 +182,7 @@ pub fn run(args: TrainArgs) -> Result<()> {
         );
         return Ok(());
     }
-    let mut display = JobDisplay::new(&stop);
+    let mut display = JobDisplay::new(&stop).with_page(page);
     let mut rounds = Vec::new();
     let (folder, note, result) = match args.resume {
         Some(folder) => {
@@ -242,13 +256,18 @@ pub fn run(args: TrainArgs) -> Result<()> {
         Ok(result)
     });
     display.finish();
-    let result = pool.install(|| explain_stop(result, Some(&at)))?;
+    let result = pool.install(|| explain_stop(result, Some(&at)));
+    if let Err(error) = &result {
+        display.close_page(&last_words(Err(error), Some(&at)), Some(&at));
+    }
+    let result = result?;
     let last = rounds.last().map_or(&folder, |round: &Round| &round.folder).clone();
     let (result, verdict) = match rounds.last() {
         Some(round) => (round.training.clone(), Some(round.verdict.clone())),
         None => (result, pool.install(|| judge_or_say(&folder, &stop))),
     };
     pool.install(|| write_report(&last));
+    display.close_page(&last_words(Ok(&result), Some(&last)), Some(&last));
     let by_round = note.as_ref().map_or(Ok(Vec::new()), |note| verdicts(note, &folder, &rounds))?;
     let by_round: Vec<&RecordingVerdict> = by_round.iter().collect();
     if args.json {
@@ -322,6 +341,17 @@ fn write_report(folder: &Path) {
     match report::pages::run::write(folder) {
         Ok(page) => eprintln!("report {}", page.display()),
         Err(error) => eprintln!("note: no report.html: {error}"),
+    }
+}
+
+/// The last words on the page of a training.
+fn last_words(result: std::result::Result<&TrainResult, &Error>, folder: Option<&Path>) -> String {
+    match (result, folder) {
+        (Ok(result), _) => format!("The training is over: the model is {}.", result.model.display()),
+        (Err(Error::Interrupted), Some(folder)) => {
+            format!("Stopped and saved; go on with: steersman train --resume {}", folder.display())
+        }
+        (Err(error), _) => format!("The training has ended: {error}."),
     }
 }
 

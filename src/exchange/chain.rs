@@ -96,6 +96,26 @@ pub(crate) fn check_finite(steps: &[ChainStep]) -> Result<()> {
     Ok(())
 }
 
+/// Most bytes of weights. Protocol buffers and flatbuffers must stay below 2 GiB; the rest is for names and shapes.
+const MAX_WEIGHT_BYTES: usize = (1 << 31) - (1 << 24);
+
+/// Checks that the weights fit into `file`, the name of a kind of file that must stay below 2 GiB.
+///
+/// # Errors
+///
+/// [`Error::Network`] names the layer that is too much.
+pub(crate) fn check_size(steps: &[ChainStep], file: &str) -> Result<()> {
+    let mut bytes = 0;
+    for step in steps {
+        bytes += 4 * step.weight_len();
+        if bytes > MAX_WEIGHT_BYTES {
+            let message = format!("with its weights the file would pass the 2 GiB that {file} can have");
+            return Err(Error::Network { layer: step.name.clone(), message });
+        }
+    }
+    Ok(())
+}
+
 /// `x · scale + shift` in each channel.
 pub(crate) struct ChannelAffine {
     pub scale: Vec<f64>,

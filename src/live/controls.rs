@@ -11,6 +11,9 @@ use crate::simulator::car::speed::SpeedController;
 /// ends closes its connection. This is for a browser that hangs.)
 const SILENCE: Duration = Duration::from_millis(1500);
 
+/// Largest number of actions that wait: a page that sends more is not a person's.
+const MAX_ACTIONS: usize = 64;
+
 /// Something that a page asks for and that happens once.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Action {
@@ -65,10 +68,13 @@ impl Wheel {
             Request::PutBack => Some(Action::PutBack),
             Request::TurnRound => Some(Action::TurnRound),
             Request::Finish => Some(Action::Finish),
+            // These are no one's alone.
+            Request::Pause | Request::Rate { .. } | Request::NextRun => return,
         };
         if self.holder == Some(id) {
             self.heard = Some(now);
-            self.actions.extend(action);
+            let room = MAX_ACTIONS - self.actions.len();
+            self.actions.extend(action.into_iter().take(room));
         }
     }
 

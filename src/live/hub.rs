@@ -1,5 +1,6 @@
 //! What the drive and the connections share: the newest frame, the trail, and the wheel.
 
+use std::collections::VecDeque;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
 use std::time::Instant;
@@ -8,12 +9,16 @@ use serde::Serialize;
 use tungstenite::Bytes;
 
 use super::controls::Wheel;
-use super::messages::{Hello, Request, State, TrailPoint, frame};
+use super::messages::{Hello, RecentMoment, Request, State, TrailPoint, frame};
+use super::playback::Playback;
 
 /// Simulated time between two points of the trail, s.
 const POINT_INTERVAL_S: f64 = 0.2;
 /// Largest number of points of a trail: a quarter of an hour. Of a longer trail the older half is dropped.
 const MAX_POINTS: usize = 4500;
+
+/// Length of what the charts show, simulated s.
+const RECENT_S: f64 = 20.0;
 
 /// The newest frame, and the trail up to it.
 #[derive(Debug, Default)]
@@ -24,6 +29,8 @@ struct Newest {
     trail: Vec<TrailPoint>,
     /// Simulated time of the last point, s.
     last_point_s: f64,
+    /// The last seconds of the trail.
+    recent: VecDeque<RecentMoment>,
 }
 
 /// What the drive and the connections share.
@@ -32,6 +39,7 @@ pub(super) struct Hub {
     hello: Hello,
     /// The wheel, if a person may drive.
     wheel: Option<Mutex<Wheel>>,
+    playback: Mutex<Playback>,
     newest: Mutex<Newest>,
     viewers: AtomicUsize,
     over: OnceLock<String>,
@@ -44,6 +52,7 @@ struct Opening<'a> {
     #[serde(flatten)]
     hello: &'a Hello,
     trail: &'a [TrailPoint],
+    recent: &'a VecDeque<RecentMoment>,
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
@@ -56,6 +65,7 @@ impl Hub {
         Hub {
             hello,
             wheel: by_hand.then(Mutex::default),
+            playback: Mutex::default(),
             newest: Mutex::default(),
             viewers: AtomicUsize::new(0),
             over: OnceLock::new(),
@@ -75,7 +85,7 @@ impl Hub {
     /// The first message to connection `id`.
     pub fn opening(&self, id: u64) -> String {
         let newest = lock(&self.newest);
-        let opening = Opening { id, hello: &self.hello, trail: &newest.trail };
+        let opening = Opening { id, hello: &self.hello, trail: &newest.trail, recent: &newest.recent };
         serde_json::to_string(&opening).expect("numbers, words and lists can be written as JSON")
     }
 
@@ -93,7 +103,13 @@ impl Hub {
         // Time that goes back begins another drive.
         if newest.trail_id != state.trail_id || state.time_s < newest.last_point_s || newest.trail.is_empty() {
             newest.trail.clear();
+            newest.recent.clear();
             (newest.trail_id, newest.last_point_s) = (state.trail_id, f64::NEG_INFINITY);
+        }
+        let moment = RecentMoment(state.time_s, state.steering as f32, state.expert as f32, state.cte_m as f32);
+        newest.recent.push_back(moment);
+        while newest.recent.front().is_some_and(|first| first.0 < state.time_s - RECENT_S) {
+            newest.recent.pop_front();
         }
         // The tolerance covers rounding: times are multiples of a step.
         if state.time_s - newest.last_point_s > POINT_INTERVAL_S - 1e-6 {
@@ -113,9 +129,25 @@ impl Hub {
 
     /// Handles a request of connection `id`.
     pub fn request(&self, id: u64, request: Request) {
-        if let Some(wheel) = &self.wheel {
-            lock(wheel).take(id, request, Instant::now());
+        let mut playback = lock(&self.playback);
+        match request {
+            Request::Pause => playback.paused = !playback.paused,
+            Request::Rate { rate } => playback.set_rate(rate),
+            Request::NextRun => {
+                playback.hurried_trail = Some(lock(&self.newest).trail_id);
+                playback.paused = false;
+            }
+            request => {
+                if let Some(wheel) = &self.wheel {
+                    lock(wheel).take(id, request, Instant::now());
+                }
+            }
         }
+    }
+
+    /// How fast a watched drive is to be shown.
+    pub fn playback(&self) -> Playback {
+        *lock(&self.playback)
     }
 
     /// The wheel, locked, if a person may drive.
@@ -162,6 +194,10 @@ mod tests {
         }
         let trail = |hub: &Hub| serde_json::from_str::<serde_json::Value>(&hub.opening(7)).unwrap()["trail"].clone();
         assert_eq!(trail(&hub).as_array().unwrap().len(), 50);
+        hub.extend_trail(&state(0, 25.0));
+        let opening: serde_json::Value = serde_json::from_str(&hub.opening(7)).unwrap();
+        let recent = opening["recent"].as_array().unwrap();
+        assert_eq!((&recent[0][0], &recent.last().unwrap()[0]), (&serde_json::json!(5.0), &serde_json::json!(25.0)));
         hub.extend_trail(&state(1, 3.0));
         assert_eq!(trail(&hub), serde_json::json!([[3.0, 0.0, 0.0]]));
         for k in 0..20_000 {
@@ -174,6 +210,17 @@ mod tests {
         assert!((0..all.len() - 1).all(|k| next(k) == next(0)), "no gaps: pages do not draw across them");
         hub.extend_trail(&state(2, 1.0));
         assert_eq!(trail(&hub).as_array().unwrap().len(), 1, "another drive");
+    }
+
+    #[test]
+    fn every_viewer_can_pause_and_hurry_the_run_that_is_shown() {
+        let hub = Hub::new(Hello::default(), false);
+        hub.extend_trail(&State { trail_id: 3, ..State::default() });
+        hub.request(1, Request::Pause);
+        hub.request(2, Request::Rate { rate: 100.0 });
+        assert_eq!(hub.playback(), Playback { paused: true, rate: 16.0, hurried_trail: None });
+        hub.request(1, Request::NextRun);
+        assert_eq!(hub.playback(), Playback { paused: false, rate: 16.0, hurried_trail: Some(3) });
     }
 
     #[test]

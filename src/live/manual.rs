@@ -129,7 +129,12 @@ impl<'a> ManualDrive<'a> {
         });
         let folder = (rows > 0).then(|| folder.finish_anyhow());
         let words = match &folder {
-            Some(folder) => format!("{rows} rows are in {}", folder.display()),
+            Some(folder) => {
+                let folder = folder.display();
+                format!(
+                    "{rows} rows are in {folder}; look at them with steersman inspect {folder}, train with steersman train {folder}"
+                )
+            }
             None => format!("nothing was recorded, so there is no {}", out.display()),
         };
         if let Some(trouble) = trouble {

@@ -6,11 +6,13 @@
 use serde::{Deserialize, Serialize};
 
 use super::coverage::Shares;
+use super::playback::Playback;
 use crate::report::charts::map;
 use crate::report::charts::palette::{self, heat_hex};
 use crate::simulator::car::dynamics::MAX_STEER_DEG;
 use crate::simulator::car::expert::pursuit;
 use crate::simulator::car::speed::telemetry_mph;
+use crate::simulator::trial::outcome::Failure;
 use crate::simulator::{Simulation, Track};
 
 /// A request of the page.
@@ -37,6 +39,15 @@ pub enum Request {
     TurnRound,
     /// End the drive and finish the recording.
     Finish,
+    /// Let the time of a watched drive stand still, or go on.
+    Pause,
+    /// How fast it goes.
+    Rate {
+        /// Simulated seconds a second.
+        rate: f64,
+    },
+    /// Drive on to the end of this run without showing it in real time.
+    NextRun,
 }
 
 /// Keys, mouse and gamepad. Values out of range count as the nearest value in range.
@@ -60,7 +71,7 @@ pub struct Input {
 /// What stays the same during a drive.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct Hello {
-    /// `watch` or `manual`.
+    /// `watch`, `manual` or `beside`: beside the model of a server.
     pub mode: &'static str,
     /// Who steers, or where the recording goes.
     pub subject: String,
@@ -101,6 +112,34 @@ impl Hello {
             saliency: (0..=8).map(|k| palette::saliency_hex(f64::from(k) / 8.0)).collect(),
         }
     }
+
+    /// The greeting for a drive beside `driver`, the model of a server: the place of the car is not known.
+    pub fn beside(driver: String) -> Hello {
+        Hello {
+            mode: "beside",
+            subject: driver,
+            full_lock_deg: MAX_STEER_DEG,
+            palette: [palette::MODEL, palette::REFERENCE],
+            ..Hello::default()
+        }
+    }
+}
+
+/// The result of a run that is over.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct RunResult {
+    /// Which one, as in `run 2 of 5 (seed 2), without help`.
+    pub run: String,
+    /// Whole laps driven.
+    pub laps: usize,
+    /// Why it ended early.
+    pub failure: Option<Failure>,
+    /// How often the car was put back.
+    pub put_back: usize,
+    /// Simulated time, s.
+    pub time_s: f64,
+    /// Mean distance from the line, m.
+    pub cte_mean_m: f64,
 }
 
 /// A point of the trail.
@@ -109,6 +148,19 @@ pub struct TrailPoint(
     /// East, m.
     pub f32,
     /// North, m.
+    pub f32,
+    /// Cross-track error, m.
+    pub f32,
+);
+
+/// A moment of the last seconds, from which the charts are drawn.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct RecentMoment(
+    /// Simulated time, s.
+    pub f64,
+    /// Steering, [-1, 1], + = right.
+    pub f32,
+    /// That of the expert.
     pub f32,
     /// Cross-track error, m.
     pub f32,
@@ -131,7 +183,7 @@ pub struct State {
     pub heading: [f64; 2],
     /// Steering, [-1, 1], + = right.
     pub steering: f64,
-    /// Steering of the expert at this place, [-1, 1], + = right.
+    /// Steering of the expert at this place, or, beside the model of a server, of the model; [-1, 1], + = right.
     pub expert: f64,
     /// Throttle, [-1, 1], from the brake to the accelerator.
     pub throttle: f64,
@@ -148,6 +200,15 @@ pub struct State {
     /// State of the recording, when a person drives.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub manual: Option<Manual>,
+    /// Who has the wheel, beside the model of a server.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub takeover: Option<Takeover>,
+    /// Results of the last runs that are over.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub results: Vec<RunResult>,
+    /// How fast a watched drive is shown.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub playback: Option<Playback>,
 }
 
 impl State {
@@ -185,6 +246,17 @@ pub struct Manual {
     pub coverage: Shares,
     /// What to do next, the most important first.
     pub advice: Vec<String>,
+}
+
+/// Who has the wheel of a car that a server drives.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct Takeover {
+    /// Connection that may steer.
+    pub driver: Option<u64>,
+    /// Whether the command is the person's.
+    pub by_user: bool,
+    /// Rows recorded so far in which the person steered; `None` without a recording.
+    pub rows: Option<u64>,
 }
 
 /// The last message.

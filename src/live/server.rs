@@ -12,6 +12,7 @@ use tungstenite::{Message, WebSocket};
 use super::controls::Wheel;
 use super::hub::Hub;
 use super::messages::{Farewell, Hello, Request, State};
+use super::playback::Playback;
 use crate::error::{Error, Result};
 use crate::net::connections::{Peer, Rank};
 use crate::net::handshake;
@@ -90,6 +91,11 @@ impl Live {
     /// Shows a frame: the JPEG of the camera, and the JPEG of the same picture with saliency, or nothing.
     pub fn publish(&self, state: &State, camera_jpeg: &[u8], saliency_jpeg: &[u8]) {
         self.hub.publish(state, camera_jpeg, saliency_jpeg);
+    }
+
+    /// How fast the pages want a watched drive to be shown.
+    pub(super) fn playback(&self) -> Playback {
+        self.hub.playback()
     }
 
     /// Calls `look` with the wheel, if a person may drive.

@@ -2,8 +2,8 @@
 
 use std::time::{Duration, Instant};
 
-use super::messages::State;
-use super::real_time::RealTime;
+use super::messages::{RunResult, State};
+use super::playback::PlaybackClock;
 use super::server::Live;
 use crate::error::Result;
 use crate::observer::{Observer, StopSignal};
@@ -11,10 +11,13 @@ use crate::picture::RgbImage;
 use crate::pilot::Pilot;
 use crate::report::explain::saliency::Saliency;
 use crate::simulator::camera::jpeg;
+use crate::simulator::trial::outcome::{Trial, line_errors_m};
 use crate::simulator::{DriveEvent, DriveFrame, HEIGHT, TrialOptions, WIDTH};
 
 /// Longest time until a wait notices that it has to end.
 const TICK: Duration = Duration::from_millis(50);
+/// Largest number of results on the page.
+const MAX_RESULTS: usize = 12;
 
 /// Shows the runs of a drive on a page, in real time.
 pub struct Watch<'a> {
@@ -24,14 +27,78 @@ pub struct Watch<'a> {
     /// A copy of the pilot, and its saliency. The driver itself is left alone, so that its drive stays the same.
     saliency: Option<(Pilot, Saliency)>,
     runs: usize,
-    real_time: Option<RealTime>,
+    clock: PlaybackClock,
+    shown: Shown,
+    results: Vec<RunResult>,
+    /// The run, without its driver.
+    run: String,
     title: String,
     trail_id: u64,
     /// Number of seeds begun. A seed may be driven twice.
     begun: usize,
     seed: Option<u64>,
     image: RgbImage,
+}
+
+/// The last frame on the page.
+#[derive(Default)]
+pub(super) struct Shown {
+    state: State,
     camera_jpeg: Vec<u8>,
+    saliency_jpeg: Vec<u8>,
+}
+
+impl Shown {
+    /// Shows a frame, whose JPEGs `draw` makes if anybody looks.
+    ///
+    /// # Errors
+    ///
+    /// Those of `draw`.
+    pub fn show(
+        &mut self,
+        live: &Live,
+        state: State,
+        draw: impl FnOnce(&mut Vec<u8>, &mut Vec<u8>) -> Result<()>,
+    ) -> Result<()> {
+        live.extend_trail(&state);
+        if live.viewers() == 0 {
+            return Ok(());
+        }
+        self.camera_jpeg.clear();
+        self.saliency_jpeg.clear();
+        draw(&mut self.camera_jpeg, &mut self.saliency_jpeg)?;
+        self.state = State { playback: Some(live.playback()), ..state };
+        live.publish(&self.state, &self.camera_jpeg, &self.saliency_jpeg);
+        Ok(())
+    }
+
+    /// Waits on `clock` until the run with trail `trail_id` has reached the simulated time `time_s`. What the pages ask for
+    /// meanwhile is shown at once.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Interrupted`](crate::Error::Interrupted) if the stop is requested.
+    pub fn wait(
+        &mut self,
+        clock: &mut PlaybackClock,
+        live: &Live,
+        (trail_id, time_s): (u64, f64),
+        stop: &StopSignal,
+    ) -> Result<()> {
+        loop {
+            stop.check()?;
+            let playback = live.playback();
+            if self.state.playback.is_some_and(|shown| shown != playback) {
+                self.state.playback = Some(playback);
+                live.publish(&self.state, &self.camera_jpeg, &self.saliency_jpeg);
+            }
+            let left = clock.until(time_s, trail_id, &playback, Instant::now());
+            if left.is_some_and(|left| left.is_zero()) {
+                return Ok(());
+            }
+            std::thread::sleep(left.unwrap_or(TICK).min(TICK));
+        }
+    }
 }
 
 impl<'a> Watch<'a> {
@@ -45,26 +112,15 @@ impl<'a> Watch<'a> {
             driver,
             saliency,
             runs,
-            real_time: None,
+            clock: PlaybackClock::start(Instant::now()),
+            shown: Shown::default(),
+            results: Vec::new(),
+            run: String::new(),
             title: String::new(),
             trail_id: 0,
             begun: 0,
             seed: None,
             image: RgbImage { height: HEIGHT, width: WIDTH, pixels: vec![0; HEIGHT * WIDTH * 3] },
-            camera_jpeg: Vec::new(),
-        }
-    }
-
-    /// Waits until the clock has reached the simulated time `time_s`.
-    fn wait(&mut self, time_s: f64) -> Result<()> {
-        let real_time = self.real_time.get_or_insert_with(|| RealTime::start(Instant::now()));
-        loop {
-            self.stop.check()?;
-            let left = real_time.until(time_s, Instant::now());
-            if left.is_zero() {
-                return Ok(());
-            }
-            std::thread::sleep(left.min(TICK));
         }
     }
 }
@@ -74,6 +130,7 @@ impl<'e> Observer<DriveEvent<'e>> for Watch<'_> {
         match event {
             DriveEvent::Begin { seed, options } => self.begin(seed, options),
             DriveEvent::Frame(frame) => return self.frame(frame),
+            DriveEvent::End(trial) => self.end(trial),
         }
         Ok(())
     }
@@ -82,35 +139,48 @@ impl<'e> Observer<DriveEvent<'e>> for Watch<'_> {
 impl Watch<'_> {
     fn begin(&mut self, seed: u64, options: &TrialOptions) {
         self.begun += usize::from(self.seed != Some(seed));
-        (self.seed, self.real_time, self.trail_id) = (Some(seed), None, self.trail_id + 1);
+        (self.seed, self.trail_id) = (Some(seed), self.trail_id + 1);
+        self.clock = PlaybackClock::start(Instant::now());
         let help = if options.assisted { "again, put back when 1 m off the middle" } else { "without help" };
-        self.title = format!("{}, run {} of {} (seed {seed}), {help}", self.driver, self.begun, self.runs);
+        self.run = format!("run {} of {} (seed {seed}), {help}", self.begun, self.runs);
+        self.title = format!("{}, {}", self.driver, self.run);
+    }
+
+    fn end(&mut self, trial: &Trial) {
+        self.results.push(RunResult {
+            run: self.run.clone(),
+            laps: trial.laps_completed,
+            failure: trial.failure,
+            put_back: trial.interventions,
+            time_s: trial.time_s,
+            cte_mean_m: line_errors_m(trial.moments.iter())[0],
+        });
+        let too_many = self.results.len().saturating_sub(MAX_RESULTS);
+        self.results.drain(..too_many);
     }
 
     fn frame(&mut self, frame: &DriveFrame) -> Result<()> {
-        self.wait(frame.simulation.time_s())?;
-        let mut state = State {
+        let moment = (self.trail_id, frame.simulation.time_s());
+        self.shown.wait(&mut self.clock, self.live, moment, self.stop)?;
+        let state = State {
+            title: self.title.clone(),
             trail_id: self.trail_id,
             steering: frame.steering,
             throttle: frame.throttle,
             put_back: frame.interventions,
+            results: self.results.clone(),
             ..State::of(frame.simulation)
         };
-        self.live.extend_trail(&state);
-        if self.live.viewers() == 0 {
-            return Ok(());
-        }
-        state.title.clone_from(&self.title);
-        self.camera_jpeg.clear();
-        jpeg::encode(frame.picture, &mut self.camera_jpeg)?;
-        let mut saliency_jpeg = Vec::new();
-        if let Some((pilot, saliency)) = &mut self.saliency {
-            saliency.steer(pilot, frame.picture.view())?;
-            self.image.pixels.copy_from_slice(&frame.picture.pixels);
-            saliency.overlay(&pilot.recipe().preprocessing, &mut self.image);
-            saliency_jpeg = self.image.to_jpeg();
-        }
-        self.live.publish(&state, &self.camera_jpeg, &saliency_jpeg);
-        Ok(())
+        let Watch { saliency, image, .. } = self;
+        self.shown.show(self.live, state, |camera_jpeg, saliency_jpeg| {
+            jpeg::encode(frame.picture, camera_jpeg)?;
+            if let Some((pilot, saliency)) = saliency {
+                saliency.steer(pilot, frame.picture.view())?;
+                image.pixels.copy_from_slice(&frame.picture.pixels);
+                saliency.overlay(&pilot.recipe().preprocessing, image);
+                *saliency_jpeg = image.to_jpeg();
+            }
+            Ok(())
+        })
     }
 }

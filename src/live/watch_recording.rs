@@ -1,10 +1,11 @@
 //! Shows a drive on a recording in real time.
 
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use super::messages::{Hello, State};
-use super::real_time::RealTime;
+use super::playback::PlaybackClock;
 use super::server::Live;
+use super::watch::Shown;
 use crate::error::Result;
 use crate::geometry::{MPH_PER_MPS, Offset, Pose};
 use crate::observer::StopSignal;
@@ -14,8 +15,6 @@ use crate::report::charts::map;
 use crate::report::charts::palette::{self, heat_hex};
 use crate::report::explain::saliency::Saliency;
 
-/// Longest time until a wait notices that it has to end.
-const TICK: Duration = Duration::from_millis(50);
 /// Room between the paths of two sessions on the map, m.
 const BETWEEN_M: f64 = 10.0;
 
@@ -29,7 +28,8 @@ pub struct WatchRecording<'a> {
     origins: Vec<[f64; 2]>,
     lengths_m: Vec<f64>,
     session: Option<usize>,
-    real_time: RealTime,
+    clock: PlaybackClock,
+    shown: Shown,
     put_back: usize,
 }
 
@@ -92,7 +92,8 @@ impl<'a> WatchRecording<'a> {
             origins: origins(log),
             lengths_m: log.sessions.iter().map(|session| session.path.length_m()).collect(),
             session: None,
-            real_time: RealTime::start(Instant::now()),
+            clock: PlaybackClock::start(Instant::now()),
+            shown: Shown::default(),
             put_back: 0,
         }
     }
@@ -104,17 +105,10 @@ impl<'a> WatchRecording<'a> {
     /// [`Error::Interrupted`](crate::Error::Interrupted) if the stop is requested; as [`Pilot::steer`].
     pub fn show(&mut self, session: usize, frame: &ReplayFrame) -> Result<()> {
         if self.session != Some(session) {
-            (self.session, self.real_time, self.put_back) = (Some(session), RealTime::start(Instant::now()), 0);
+            (self.session, self.clock, self.put_back) = (Some(session), PlaybackClock::start(Instant::now()), 0);
         }
         let moment = &frame.moment;
-        loop {
-            self.stop.check()?;
-            let left = self.real_time.until(moment.time_s, Instant::now());
-            if left.is_zero() {
-                break;
-            }
-            std::thread::sleep(left.min(TICK));
-        }
+        self.shown.wait(&mut self.clock, self.live, (session as u64, moment.time_s), self.stop)?;
         self.put_back += usize::from(moment.put_back);
         let [east, north] = self.origins[session];
         let heading = moment.heading_deg.to_radians();
@@ -134,18 +128,16 @@ impl<'a> WatchRecording<'a> {
             put_back: self.put_back,
             ..State::default()
         };
-        self.live.extend_trail(&state);
-        if self.live.viewers() == 0 {
-            return Ok(());
-        }
-        let mut saliency_jpeg = Vec::new();
-        if let Some((pilot, saliency)) = &mut self.saliency {
-            saliency.steer(pilot, frame.view.view())?;
-            let mut image = frame.view.clone();
-            saliency.overlay(&pilot.recipe().preprocessing, &mut image);
-            saliency_jpeg = image.to_jpeg();
-        }
-        self.live.publish(&state, &frame.view.to_jpeg(), &saliency_jpeg);
-        Ok(())
+        let saliency = &mut self.saliency;
+        self.shown.show(self.live, state, |camera_jpeg, saliency_jpeg| {
+            *camera_jpeg = frame.view.to_jpeg();
+            if let Some((pilot, saliency)) = saliency {
+                saliency.steer(pilot, frame.view.view())?;
+                let mut image = frame.view.clone();
+                saliency.overlay(&pilot.recipe().preprocessing, &mut image);
+                *saliency_jpeg = image.to_jpeg();
+            }
+            Ok(())
+        })
     }
 }

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
+use clap::ValueEnum;
 use numpy::{IntoPyArray, PyArray1, PyArray2, PyArray3, PyArrayDyn, PyReadonlyArray3};
 use pyo3::exceptions::PyKeyError;
 use pyo3::prelude::*;
@@ -12,8 +13,10 @@ use steersman_kernels::Isa;
 use super::arrays::{bytes, plain};
 use super::exceptions::warn;
 use super::work;
+use crate::cli::export::{ExportRequest, Format};
 use crate::cli::model_arg::model_file;
 use crate::cli::summary;
+use crate::error::Error;
 use crate::model_file::{Model as ModelFile, notice_without_digest, weights_hash};
 use crate::picture::RgbImage;
 use crate::pilot::Pilot;
@@ -133,6 +136,31 @@ impl Model {
             Ok::<_, crate::Error>((steering, map, overlay.view().to_owned()))
         })?;
         Ok((steering, map.into_pyarray(py), overlay.into_pyarray(py)))
+    }
+
+    #[pyo3(signature = (file, *, to = None, with_preprocessing = false, fold_batch_norm = false, throttle = None, force = false))]
+    #[allow(clippy::too_many_arguments, reason = "they have names in Python")]
+    fn export<'py>(
+        &self,
+        py: Python<'py>,
+        file: PathBuf,
+        to: Option<String>,
+        with_preprocessing: bool,
+        fold_batch_norm: bool,
+        throttle: Option<f32>,
+        force: bool,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        let extension = file.extension().unwrap_or_default().to_string_lossy().into_owned();
+        let name = to.unwrap_or(if extension == "rs" { "rust".into() } else { extension });
+        let to = Format::from_str(&name, false).map_err(|_| {
+            let known = Format::value_variants()
+                .iter()
+                .filter_map(|format| Some(format.to_possible_value()?.get_name().to_string()));
+            Error::Usage(format!("to = {name:?}: formats are {}", known.collect::<Vec<_>>().join(", ")))
+        })?;
+        let request = ExportRequest { to, file, with_preprocessing, fold_batch_norm, throttle, force };
+        let exported = py.detach(|| request.write(&self.path, &self.file))?;
+        plain(py, &exported)
     }
 
     fn summary(&self) -> PyResult<String> {

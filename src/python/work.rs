@@ -41,6 +41,7 @@ impl News {
             News::Share(share) => [("share", share)].into_py_dict(py),
             News::Begin(what) => [("begin", what)].into_py_dict(py),
             News::Notice(text) | News::Training(TrainingEvent::Notice(text)) => [("notice", text)].into_py_dict(py),
+            News::Training(TrainingEvent::Begin { folder }) => [("folder", folder)].into_py_dict(py),
             News::Training(TrainingEvent::Batch { epoch, epochs, images, of, loss }) => {
                 let dict = [("epoch", *epoch as usize), ("epochs", *epochs as usize), ("images", *images), ("of", *of)]
                     .into_py_dict(py)?;

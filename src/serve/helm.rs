@@ -2,8 +2,11 @@
 
 use std::time::{Duration, Instant};
 
+use super::co_driver::{HandWheel, Hands};
 use crate::simulator::DriverAnswer;
-use crate::simulator::car::speed::{SpeedController, slower_in_bends_mph};
+use crate::simulator::car::dynamics::STEP_S;
+use crate::simulator::car::keys;
+use crate::simulator::car::speed::{Pace, SpeedController, slower_in_bends_mph};
 use crate::udacity::Command;
 
 /// How the car is driven.
@@ -31,8 +34,15 @@ pub const HOLD_TIME: Duration = Duration::from_millis(500);
 const MAX_BLIND_BRAKE_S: f64 = 3.0;
 /// Speed below which the helm does not brake, mph: the simulator drives backwards when it brakes below 5 mph.
 const MIN_BRAKE_MPH: f64 = 5.0;
+/// Largest number of the wheel's steps between two frames: after a longer gap, a key does not throw the wheel round.
+const MAX_KEY_STEPS: f64 = 10.0;
 /// Throttle of the brake.
 const BRAKE: f32 = -1.0;
+
+/// Steering that a car can follow, [-1, 1]: 0 for what is not finite.
+pub fn usable(steering: f32) -> f32 {
+    if steering.is_finite() { steering.clamp(-1.0, 1.0) } else { 0.0 }
+}
 
 /// The time of a frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -75,7 +85,7 @@ impl Helm {
     pub fn command_for(&mut self, answer: DriverAnswer, speed_mph: f64, time: FrameTime) -> Command {
         let time_s = self.seconds(time);
         let DriverAnswer { steering, pace } = answer;
-        let mut steering = if steering.is_finite() { steering.clamp(-1.0, 1.0) } else { 0.0 };
+        let mut steering = usable(steering);
         if let Some(last_s) = self.last_s.filter(|_| self.options.smooth_s > 0.0) {
             let share = 1.0 - (-(time_s - last_s).max(0.0) / self.options.smooth_s).exp();
             steering = self.last.steering + share as f32 * (steering - self.last.steering);
@@ -87,6 +97,31 @@ impl Helm {
         let throttle = match pace.filter(|_| self.options.pace_of_model) {
             Some(pace) => self.controller.throttle_for(pace, time_s, target_mph, speed_mph),
             None => self.controller.throttle_at(time_s, target_mph, speed_mph),
+        };
+        self.last_s = Some(time_s);
+        self.last_frame = Some((time, Instant::now()));
+        self.last = Command { steering, throttle };
+        self.last
+    }
+
+    /// The command of a person for the frame of `time`; the car drives at `speed_mph`. Keys move the wheel from where it is.
+    /// The accelerator ends at the speed to hold, and the brake where a simulator would drive backwards.
+    pub fn command_by_hand(&mut self, hands: Hands, speed_mph: f64, time: FrameTime) -> Command {
+        let time_s = self.seconds(time);
+        let steering = match hands.wheel {
+            HandWheel::At(steering) => steering.clamp(-1.0, 1.0),
+            HandWheel::Keys(pressed) => {
+                let steps = self.last_s.map_or(1.0, |last_s| ((time_s - last_s) / STEP_S).round());
+                let steps = steps.clamp(1.0, MAX_KEY_STEPS) as usize;
+                (0..steps).fold(f64::from(self.last.steering), |wheel, _| keys::wheel(wheel, pressed)) as f32
+            }
+        };
+        let throttle = match hands.throttle {
+            None => self.controller.throttle_at(time_s, self.options.speed_mph, speed_mph),
+            Some(throttle) => {
+                let pace = Pace::Throttle(throttle);
+                self.controller.throttle_for(pace, time_s, self.options.speed_mph, speed_mph)
+            }
         };
         self.last_s = Some(time_s);
         self.last_frame = Some((time, Instant::now()));
@@ -118,7 +153,7 @@ impl Helm {
     }
 
     /// Seconds of `time` since the drive began.
-    fn seconds(&self, time: FrameTime) -> f64 {
+    pub fn seconds(&self, time: FrameTime) -> f64 {
         match time {
             FrameTime::Arrival(arrived) => arrived.saturating_duration_since(self.began).as_secs_f64(),
             FrameTime::Simulated(time_s) => time_s,
@@ -134,7 +169,6 @@ impl Helm {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::simulator::car::speed::Pace;
     use std::time::Duration;
 
     impl Helm {
@@ -183,6 +217,22 @@ mod tests {
         assert_eq!(at(true, Pace::SpeedMph(25.0), 10.0), held(15.0, 10.0));
         let mut without = Helm::new(HelmOptions { pace_of_model: true, ..Default::default() });
         assert_eq!(without.command(0.0, 10.0, FrameTime::Simulated(0.0)).throttle, held(15.0, 10.0));
+    }
+
+    #[test]
+    fn keys_move_the_wheel_from_where_the_model_left_it_and_the_speed_is_held() {
+        let mut helm = Helm::new(HelmOptions::default());
+        let left_at = helm.command(0.3, 14.0, FrameTime::Simulated(0.0)).steering;
+        let hands = |wheel, throttle| Hands { wheel, throttle };
+        // Three steps of 20 ms, 0.05 each.
+        let command = helm.command_by_hand(hands(HandWheel::Keys(-1.0), None), 14.0, FrameTime::Simulated(0.06));
+        assert!((command.steering - (left_at - 0.15)).abs() < 1e-6 && command.throttle > 0.0, "{command:?}");
+        let command = helm.command_by_hand(hands(HandWheel::Keys(1.0), None), 14.0, FrameTime::Simulated(9.0));
+        assert!((command.steering - (left_at - 0.15 + 0.5)).abs() < 1e-6, "ten steps at most: {command:?}");
+        for (mph, throttle) in [(10.0, -0.7), (4.0, 0.0)] {
+            let command = helm.command_by_hand(hands(HandWheel::At(2.0), Some(-0.7)), mph, FrameTime::Simulated(9.05));
+            assert_eq!(command, Command { steering: 1.0, throttle });
+        }
     }
 
     #[test]

@@ -62,6 +62,8 @@ pub enum Incident {
     SecondTerm,
     /// A person drives by hand.
     Override,
+    /// A person drives from the server's page.
+    CoDriver,
     /// The car does not follow the throttle.
     ThrottleIgnored,
     /// A row could not be recorded in time.
@@ -117,6 +119,7 @@ impl Incident {
             Incident::DecimalMark => "commands are written in the same way, no change of the language is needed",
             Incident::SecondTerm => "it gets numbers instead of strings",
             Incident::Override => "release W and S to let the model drive",
+            Incident::CoDriver => "release the keys to let the model drive",
             Incident::ThrottleIgnored => {
                 "is this the car's camera view with no key held? Other programs on port 4567 can answer in between: close them"
             }

@@ -2,7 +2,7 @@
 //!
 //! [`Server`] listens; each connection has a thread of its own, and one of them holds the seat and drives: a picture
 //! comes in, the [`Pilot`] steers, the helm makes the command. `tokens` keeps one telemetry in flight, `recording`
-//! writes what was driven, `journal` tells the user what is wrong and what to do. The messages are those of
+//! writes what was driven, `co_driver` lets a person take the wheel, `journal` tells the user what is wrong and what to do. The messages are those of
 //! [`udacity`](crate::udacity).
 //!
 //! The server trusts no client: it bounds the number of connections, and the size and the time of each message, and it
@@ -22,13 +22,14 @@
 //!     Ok(())
 //! };
 //! let stop = StopSignal::default(); // a request from elsewhere ends the server
-//! let summary = Server::bind(ServerOptions::default())?.run(pilot, &mut observer, &stop)?;
+//! let summary = Server::bind(ServerOptions::default())?.run(pilot, None, &mut observer, &stop)?;
 //! println!("{} frames answered", summary.frames);
 //! # Ok::<(), steersman::Error>(())
 //! ```
 //!
 //! [`Pilot`]: crate::pilot::Pilot
 
+mod co_driver;
 mod connection;
 mod handshake;
 mod helm;
@@ -44,6 +45,7 @@ mod shared;
 mod statistics;
 mod tokens;
 
+pub use co_driver::{AnsweredFrame, CoDriver, HandWheel, Hands};
 pub use helm::HelmOptions;
 pub use journal::Incident;
 pub use options::ServerOptions;

@@ -137,6 +137,11 @@ impl Recorder {
         }
     }
 
+    /// Rows so far in which a person steered.
+    pub fn rows_by_user(&self) -> u64 {
+        self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner).by_user
+    }
+
     /// Waits until all rows are written, and removes a recording without a row.
     ///
     /// # Errors

@@ -7,6 +7,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::Scope;
 use std::time::{Duration, Instant};
 
+use super::co_driver::CoDriver;
 use super::connection;
 use super::journal::{Incident, Journal};
 use super::options::ServerOptions;
@@ -65,7 +66,7 @@ impl Server {
         self.listener.local_addr().map_err(|e| Error::System(format!("cannot tell the address: {e}")))
     }
 
-    /// Serves until `stop` is requested, and then cuts the throttle of the driven car.
+    /// Serves until `stop` is requested, and then cuts the throttle of the driven car. A `co_driver` may take the wheel.
     ///
     /// # Errors
     ///
@@ -73,6 +74,7 @@ impl Server {
     pub fn run(
         self,
         pilot: Pilot,
+        co_driver: Option<&dyn CoDriver>,
         observer: &mut (dyn Observer<ServeEvent> + Send),
         stop: &StopSignal,
     ) -> Result<Summary> {
@@ -82,6 +84,7 @@ impl Server {
             pilot: Mutex::new(pilot),
             seat: Seat::default(),
             journal: Journal::new(observer, options.check),
+            co_driver,
             recorder,
             recording_failed: AtomicBool::new(false),
             stop,

@@ -3,6 +3,7 @@
 use std::sync::atomic::AtomicBool;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
+use super::co_driver::CoDriver;
 use super::journal::Journal;
 use super::options::ServerOptions;
 use super::recording::Recorder;
@@ -18,6 +19,7 @@ pub(super) struct Shared<'a> {
     pub pilot: Mutex<Pilot>,
     pub seat: Seat,
     pub journal: Journal<'a>,
+    pub co_driver: Option<&'a dyn CoDriver>,
     pub recorder: Option<Recorder>,
     pub recording_failed: AtomicBool,
     pub stop: &'a StopSignal,

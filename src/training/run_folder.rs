@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use steersman_kernels::conv::ConvAlgorithm;
 
 use super::history::{EpochRecord, history_csv, read_history};
-use super::run::TrainResult;
+use super::request::TrainResult;
 use crate::dataset::Description;
 use crate::error::{Error, Result};
 use crate::files::lock::{LOCK_NAME, Lock};
@@ -234,6 +234,11 @@ impl RunFolder {
     /// [`Error::Io`] and [`Error::Data`] for a damaged folder.
     pub fn info(&self) -> Result<RunInfo> {
         self.read_json("run.json")
+    }
+
+    /// Where it is.
+    pub fn path(&self) -> &Path {
+        &self.path
     }
 
     /// A file in the folder.

@@ -157,6 +157,31 @@ impl Browser {
         [0, 1].map(|k| place[k].as_f64().unwrap())
     }
 
+    /// Sets what `prefers-color-scheme` asks for: `light` or `dark`.
+    pub fn prefer(&mut self, scheme: &str) {
+        let features = json!({ "features": [{ "name": "prefers-color-scheme", "value": scheme }] });
+        self.tell("Emulation.setEmulatedMedia", features);
+    }
+
+    /// Fails if the page scrolls sideways.
+    pub fn assert_no_sideways_scrolling(&mut self, when: &str) {
+        let fits = "document.documentElement.scrollWidth <= document.documentElement.clientWidth";
+        assert_eq!(self.value(fits), true, "{when}");
+    }
+
+    /// Fails if the words of an element that `selector` finds have less contrast to the page than WCAG AA asks for: 4.5.
+    pub fn assert_contrast(&mut self, selector: &str, when: &str) {
+        let pale = format!(
+            "(() => {{ const light = text => {{ const [r, g, b] = text.match(/[0-9.]+/g).map(v => v / 255)
+               .map(v => v <= .04045 ? v / 12.92 : ((v + .055) / 1.055) ** 2.4); return .2126 * r + .7152 * g + .0722 * b; }};
+               const paper = light(getComputedStyle(document.body).backgroundColor);
+               return [...document.querySelectorAll('{selector}')]
+               .filter(e => e.offsetParent && e.textContent.trim()).map(e => [light(getComputedStyle(e).color), e.outerHTML])
+               .filter(([ink]) => (Math.max(ink, paper) + .05) / (Math.min(ink, paper) + .05) < 4.5).map(([, html]) => html); }})()"
+        );
+        assert_eq!(self.value(&pale), json!([]), "contrast, {when}");
+    }
+
     /// How many different colours a canvas shows.
     pub fn colours(&mut self, canvas: &str) -> u64 {
         let value = self.value(&format!(

@@ -136,6 +136,32 @@ def test_summary_is_that_of_the_command_line(steersman_program, model):
     assert steersman_program("summary", model.path)[1].strip() == model.summary().strip()
 
 
+@pytest.mark.parametrize(
+    ("name", "settings", "args"),
+    [
+        ("model.onnx", {"with_preprocessing": True}, ["--to", "onnx", "--with-preprocessing"]),
+        ("model.onnx", {"to": "onnx", "fold_batch_norm": True}, ["--to", "onnx", "--fold-batch-norm"]),
+        ("model.c", {}, ["--to", "c"]),
+        ("model.rs", {}, ["--to", "rust"]),
+        ("model.tflite", {"throttle": 0.2}, ["--to", "tflite", "--throttle", "0.2"]),
+    ],
+)
+def test_exports_are_those_of_the_command_line(model, name, settings, args, steersman_program, tmp_path):
+    exported = model.export(tmp_path / name, **settings)
+    code, _, err = steersman_program("export", model.path, tmp_path / f"other.{name}", *args)
+    assert code == 0, err
+    assert (tmp_path / name).read_bytes() == (tmp_path / f"other.{name}").read_bytes()
+    assert exported["bytes"] == (tmp_path / name).stat().st_size
+    with pytest.raises(steersman.UsageError, match="exists and stays as it is"):
+        model.export(tmp_path / name, **settings)
+    model.export(tmp_path / name, force=True, **settings)
+
+
+def test_formats_that_are_not_known_are_an_error(model, tmp_path):
+    with pytest.raises(steersman.UsageError, match="formats are onnx, c, rust, tflite"):
+        model.export(tmp_path / "model.pt")
+
+
 def test_exceptions_can_be_caught_as_those_of_python():
     assert issubclass(steersman.FileError, OSError) and issubclass(steersman.DataError, ValueError)
     assert issubclass(steersman.UsageError, ValueError)

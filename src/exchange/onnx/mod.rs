@@ -17,10 +17,10 @@ use steersman_kernels::Isa;
 
 use self::graph::{GraphBuilder, float, int, ints};
 use self::proto::{DataType, ModelProto, OperatorSetIdProto, StringStringEntryProto};
-use super::chain::{ChainStep, chain, check_finite, fold_batch_norm};
+use super::chain::{ChainStep, chain, check_finite, check_size, fold_batch_norm};
 use crate::dataset::Outputs;
 use crate::engine::layers::{ExportForm, Formula, Function};
-use crate::error::{Error, Result};
+use crate::error::Result;
 use crate::model_file::Model;
 
 /// Version of the set of standard operators. ONNX Runtime reads it from 1.12 (2022) on.
@@ -28,9 +28,6 @@ pub const OPSET: i64 = 17;
 
 /// Version of the file format that came with [`OPSET`].
 const IR_VERSION: i64 = 8;
-
-/// Most bytes of weights. A protocol buffer must stay below 2 GiB; the rest is for names and shapes.
-const MAX_WEIGHT_BYTES: usize = (1 << 31) - (1 << 24);
 
 /// How to write an ONNX file.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -53,7 +50,7 @@ pub fn onnx(model: &Model, options: OnnxOptions) -> Result<Vec<u8>> {
         steps = fold_batch_norm(steps);
     }
     check_finite(&steps)?;
-    check_size(&steps)?;
+    check_size(&steps, "an ONNX file")?;
 
     let mut graph = GraphBuilder::default();
     let [c, h, w] = recipe.preprocessing.output();
@@ -93,18 +90,6 @@ pub fn onnx(model: &Model, options: OnnxOptions) -> Result<Vec<u8>> {
         .collect(),
     };
     Ok(model.encode_to_vec())
-}
-
-fn check_size(steps: &[ChainStep]) -> Result<()> {
-    let mut bytes = 0;
-    for step in steps {
-        bytes += 4 * step.weight_len();
-        if bytes > MAX_WEIGHT_BYTES {
-            let message = "with its weights the file would pass the 2 GiB that an ONNX file can have".into();
-            return Err(Error::Network { layer: step.name.clone(), message });
-        }
-    }
-    Ok(())
 }
 
 /// Adds the nodes of the network, which reads `input`, `[N, c, h, w]`, and gives each of `outputs`, `[N, 1]`.

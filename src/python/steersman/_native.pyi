@@ -67,6 +67,23 @@ class Model:
     def saliency(self, image: NDArray[np.uint8]) -> Tuple[float, NDArray[np.float32], NDArray[np.uint8]]:
         """Steering, the map of what excites the network, and the image with the map on it; see :func:`steersman.saliency`."""
 
+    def export(
+        self,
+        file: Union[str, "os.PathLike[str]"],
+        *,
+        to: Optional[str] = None,
+        with_preprocessing: bool = False,
+        fold_batch_norm: bool = False,
+        throttle: Optional[float] = None,
+        force: bool = False,
+    ) -> Dict[str, Any]:
+        """Writes the model for other programs, as ``steersman export`` does; returns what ``export --json`` prints.
+
+        ``to`` is ``"onnx"``, ``"tflite"`` (for donkeycar), ``"c"`` or ``"rust"``; by default what the name of the file ends with.
+        ``with_preprocessing`` and ``fold_batch_norm`` are for ONNX, the others always do both: take the camera image, and merge batch
+        normalisation. ``throttle`` is the constant throttle of a TensorFlow Lite file whose model gives none. ``force`` overwrites.
+        """
+
     def summary(self) -> str:
         """The layer table, and how the model was trained."""
 

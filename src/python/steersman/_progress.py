@@ -6,7 +6,7 @@ import warnings
 from typing import Any, Callable, Dict, Optional, Union
 
 Event = Dict[str, Any]
-"""What happens, for a function that is given as ``progress``: ``{"share": 0 to 1}``; ``{"begin": what}``; a batch ``{"epoch", "epochs",
+"""What happens, for a function that is given as ``progress``: ``{"share": 0 to 1}``; ``{"begin": what}``; ``{"folder": of the run}``; a batch ``{"epoch", "epochs",
 "images", "of", "loss"}``; the end of an epoch ``{"epochs", "record": {...}}``. Batches are told at most 20 times a second."""
 
 Progress = Union[None, bool, Callable[[Event], Any]]

@@ -47,13 +47,22 @@ struct Answer {
 /// [`Error::Io`](crate::Error::Io) and [`Error::Data`](crate::Error::Data) if the folder or the recordings cannot be read.
 pub fn write(path: &Path) -> Result<PathBuf> {
     let folder = RunFolder::open(path)?;
-    let page = page(&folder, path)?;
+    let page = page(&folder, path, false)?;
     let path = folder.file("report.html");
     atomic_file::write(&path, page.as_bytes())?;
     Ok(path)
 }
 
-fn page(folder: &RunFolder, path: &Path) -> Result<String> {
+/// The page of a run that is under way, after one of its epochs. Call it inside a rayon pool.
+///
+/// # Errors
+///
+/// As [`write`].
+pub fn render_so_far(path: &Path) -> Result<String> {
+    page(&RunFolder::open(path)?, path, true)
+}
+
+fn page(folder: &RunFolder, path: &Path, under_way: bool) -> Result<String> {
     let (info, recipe, history) = (folder.info()?, folder.recipe()?, folder.history()?);
     let pilot = Pilot::load(&folder.model())?;
     let data = Data::of_run(&info, &recipe, 0)?;
@@ -66,6 +75,7 @@ fn page(folder: &RunFolder, path: &Path) -> Result<String> {
     }
     match folder.result()? {
         Some(result) => headline(&mut page, &result, drives.is_empty()),
+        None if under_way => page.advice(&so_far(history.len(), recipe.epochs), Tone::Neutral),
         None => page.advice(&unfinished(history.len(), recipe.epochs, path), Tone::Warning),
     }
     if let Some(verdict) = folder.replay()? {
@@ -90,6 +100,10 @@ fn page(folder: &RunFolder, path: &Path) -> Result<String> {
     environment(&mut page, &info, &history);
     page.folded("The recipe with every entry resolved", &recipe.to_toml()?);
     Ok(page.finish())
+}
+
+fn so_far(epochs: usize, of: u32) -> String {
+    format!("{epochs} of {of} epochs are done; this is the best model so far.")
 }
 
 fn unfinished(epochs: usize, of: u32, path: &Path) -> String {

@@ -84,7 +84,7 @@ impl DriveVideo {
 impl<'e> Observer<DriveEvent<'e>> for FilmObserver<'_> {
     fn observe(&mut self, event: DriveEvent<'e>) -> Result<()> {
         match event {
-            DriveEvent::Begin { .. } => Ok(()),
+            DriveEvent::Begin { .. } | DriveEvent::End(_) => Ok(()),
             DriveEvent::Frame(frame) => self.frame(frame),
         }
     }

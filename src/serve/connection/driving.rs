@@ -8,7 +8,8 @@ use data_encoding::BASE64;
 
 use super::{Connection, End};
 use crate::net::connections::Rank;
-use crate::serve::helm::FrameTime;
+use crate::serve::co_driver::AnsweredFrame;
+use crate::serve::helm::{self, FrameTime};
 use crate::serve::journal::Incident;
 use crate::serve::recording::{Queued, Recorder};
 use crate::serve::seat::Claim;
@@ -62,15 +63,45 @@ impl Connection<'_, '_> {
         }
         self.faults = 0;
         self.lockstep = telemetry.time_s.is_some();
-        let command = self.helm.command_for(answer, speed_mph, time);
+        let hands = self.shared.co_driver.and_then(|co_driver| co_driver.hands(Instant::now()));
+        self.tell_who_drives(hands.is_some());
+        let command = match hands {
+            Some(hands) => self.helm.command_by_hand(hands, speed_mph, time),
+            None => self.helm.command_for(answer, speed_mph, time),
+        };
         self.steer(command)?;
         self.cut = false;
         self.shared.statistics().answered(arrived, Instant::now(), command, speed_mph);
         self.check_throttle(&telemetry, command);
         if let Some(recorder) = &self.shared.recorder {
-            self.record(recorder, (time, command, speed_mph), false);
+            self.record(recorder, (time, command, speed_mph), hands.is_some());
+        }
+        if let Some(co_driver) = self.shared.co_driver {
+            let frame = AnsweredFrame {
+                time_s: self.helm.seconds(time),
+                image: &self.image,
+                steering_of_model: helm::usable(answer.steering),
+                steering: command.steering,
+                throttle: command.throttle,
+                speed_mph,
+                by_user: hands.is_some(),
+            };
+            co_driver.see(&frame, self.shared.recorder.as_ref().map(Recorder::rows_by_user));
         }
         Ok(())
+    }
+
+    /// Tells the user when the co-driver takes the wheel, and when the model gets it back.
+    fn tell_who_drives(&mut self, by_co_driver: bool) {
+        if std::mem::replace(&mut self.co_driven, by_co_driver) == by_co_driver {
+            return;
+        }
+        match by_co_driver {
+            true => {
+                self.shared.journal.report(Incident::CoDriver, format_args!("{}: driven from the page", self.address))
+            }
+            false => self.shared.journal.step(format_args!("{}: the model drives again", self.address)),
+        }
     }
 
     /// The answer of the model to a picture in base64.

@@ -115,6 +115,8 @@ struct Connection<'a, 'o> {
     lockstep: bool,
     /// Whether a person drives by hand.
     overridden: bool,
+    /// Whether the co-driver has the wheel.
+    co_driven: bool,
     /// Whether the throttle was cut because telemetry is stale.
     cut: bool,
     /// Number of commands in a row with a strong throttle that the car does not follow.

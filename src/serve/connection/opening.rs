@@ -106,6 +106,7 @@ pub(super) fn open<'a, 'o>(
         rate_limit: RateLimit::new(now),
         lockstep: false,
         overridden: false,
+        co_driven: false,
         cut: false,
         ignored: 0,
         shown: 0,

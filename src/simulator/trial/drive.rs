@@ -1,5 +1,6 @@
 //! Many trials of one driver on one track, and the comparison of two drivers.
 
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use rayon::prelude::*;
@@ -29,17 +30,47 @@ pub fn drive<F>(
 where
     F: Fn() -> Result<Box<dyn Driver>> + Sync,
 {
+    require_all(drive_as_far(track, new_driver, options, observer)?)
+}
+
+/// As [`drive`]; but if the observer ends it with [`Error::Interrupted`], the result of the seeds that were driven until then, if there
+/// are any. Also whether it was ended so.
+///
+/// # Errors
+/// As [`drive`].
+pub fn drive_as_far<F>(
+    track: &Track,
+    new_driver: F,
+    options: &DriveOptions,
+    observer: &mut (dyn Observer<Progress> + Send),
+) -> Result<(DriveResult, bool)>
+where
+    F: Fn() -> Result<Box<dyn Driver>> + Sync,
+{
     options.check()?;
-    let tally = Tally::new(options.runs, observer);
-    let measured: Vec<Measured> = (0..options.runs as u64)
+    let (tally, stopped) = (Tally::new(options.runs, observer), AtomicBool::new(false));
+    let measured: Vec<Result<Measured>> = (0..options.runs as u64)
         .into_par_iter()
         .map(|k| {
+            if stopped.load(Ordering::Relaxed) {
+                return Err(Error::Interrupted);
+            }
             let measured = measure(track, &new_driver, options, k, None)?;
-            tally.add(1)?;
+            match tally.add(1) {
+                Ok(()) => {}
+                Err(Error::Interrupted) => stopped.store(true, Ordering::Relaxed),
+                Err(error) => return Err(error),
+            }
             Ok(measured)
         })
-        .collect::<Result<_>>()?;
-    Ok(put_together(track, options, measured, rayon::current_num_threads()))
+        .collect();
+    let result = put_together(track, options, measured, rayon::current_num_threads())?;
+    Ok((result, stopped.into_inner()))
+}
+
+/// The result, if all seeds were driven.
+fn require_all((result, stopped): (DriveResult, bool)) -> Result<DriveResult> {
+    if stopped { Err(Error::Interrupted) } else { Ok(result) }
 }
 
 /// As [`drive`], to the same bits, but one trial after the other; `observer` is told every frame.
@@ -55,11 +86,32 @@ pub fn drive_observed<F>(
 where
     F: Fn() -> Result<Box<dyn Driver>>,
 {
+    require_all(drive_observed_as_far(track, new_driver, options, observer)?)
+}
+
+/// As [`drive_observed`], but with what was driven when the observer ends it, as in [`drive_as_far`].
+///
+/// # Errors
+/// As [`drive_observed`].
+pub fn drive_observed_as_far<F>(
+    track: &Track,
+    new_driver: F,
+    options: &DriveOptions,
+    observer: &mut dyn for<'a> Observer<DriveEvent<'a>>,
+) -> Result<(DriveResult, bool)>
+where
+    F: Fn() -> Result<Box<dyn Driver>>,
+{
     options.check()?;
-    let runs = 0..options.runs as u64;
-    let measured =
-        runs.map(|k| measure(track, &new_driver, options, k, Some(&mut *observer))).collect::<Result<_>>()?;
-    Ok(put_together(track, options, measured, 1))
+    let mut measured = Vec::new();
+    for k in 0..options.runs as u64 {
+        measured.push(measure(track, &new_driver, options, k, Some(&mut *observer)));
+        if measured.last().is_some_and(Result::is_err) {
+            break;
+        }
+    }
+    let stopped = measured.last().is_some_and(Result::is_err);
+    Ok((put_together(track, options, measured, 1)?, stopped))
 }
 
 /// The measurements of one seed.
@@ -107,8 +159,28 @@ where
     Ok(Measured { pair: TrialPair { seed, free, assisted }, expert, simulated_s, busy_s })
 }
 
-/// The result of all seeds, driven by `threads` threads.
-fn put_together(track: &Track, options: &DriveOptions, measured: Vec<Measured>, threads: usize) -> DriveResult {
+/// The result of all seeds that were driven, by `threads` threads; some were not if the drive was interrupted.
+///
+/// # Errors
+///
+/// [`Error::Interrupted`] if none was driven; any other error of a seed.
+fn put_together(
+    track: &Track,
+    options: &DriveOptions,
+    results: Vec<Result<Measured>>,
+    threads: usize,
+) -> Result<DriveResult> {
+    let mut measured = Vec::with_capacity(results.len());
+    for result in results {
+        match result {
+            Ok(seed) => measured.push(seed),
+            Err(Error::Interrupted) => {}
+            Err(error) => return Err(error),
+        }
+    }
+    if measured.is_empty() {
+        return Err(Error::Interrupted);
+    }
     let sum = |of: fn(&Measured) -> f64| measured.iter().map(of).sum::<f64>();
     let (simulated_s, busy_s) = (sum(|m| m.simulated_s), sum(|m| m.busy_s));
     let (expert_sum, expert_s) = (sum(|m| m.expert.whiteness_sum), sum(|m| m.expert.time_s));
@@ -121,7 +193,7 @@ fn put_together(track: &Track, options: &DriveOptions, measured: Vec<Measured>, 
         realtime_factor,
         ..summarise(track, options, &runs)
     };
-    DriveResult { trials: runs, summary }
+    Ok(DriveResult { trials: runs, summary })
 }
 
 fn summarise(track: &Track, options: &DriveOptions, runs: &[TrialPair]) -> DriveSummary {
@@ -237,12 +309,13 @@ mod tests {
 
     #[test]
     fn a_drive_that_is_watched_has_the_same_runs() {
-        struct Watching(Vec<(u64, bool)>, usize);
+        struct Watching(Vec<(u64, bool)>, usize, Vec<f64>);
         impl<'a> Observer<DriveEvent<'a>> for Watching {
             fn observe(&mut self, event: DriveEvent) -> Result<()> {
                 match event {
                     DriveEvent::Begin { seed, options } => self.0.push((seed, options.assisted)),
                     DriveEvent::Frame(_) => self.1 += 1,
+                    DriveEvent::End(trial) => self.2.push(trial.time_s),
                 }
                 Ok(())
             }
@@ -250,17 +323,51 @@ mod tests {
         let track = Track::load("lake").unwrap();
         let make = || -> Result<Box<dyn Driver>> { Ok(Box::new(Zero)) };
         let options = DriveOptions { runs: 2, seed: 3, ..Default::default() };
-        let mut watching = Watching(Vec::new(), 0);
+        let mut watching = Watching(Vec::new(), 0, Vec::new());
         let watched = drive_observed(&track, make, &options, &mut watching).unwrap();
         let unseen = drive(&track, make, &options, &mut Unobserved).unwrap();
         assert_eq!(watched.trials, unseen.trials);
         let summary = DriveSummary { realtime_factor: unseen.summary.realtime_factor, ..watched.summary };
         assert_eq!(summary, unseen.summary);
         assert_eq!(watching.0, [(3, false), (3, true), (4, false), (4, true)]);
+        let times = unseen.trials.iter().flat_map(|pair| [pair.free.time_s, pair.assisted.time_s]);
+        assert_eq!(watching.2, times.collect::<Vec<_>>());
         assert_eq!(
             watching.1,
             unseen.trials.iter().map(|r| r.free.moments.len() + r.assisted.moments.len()).sum::<usize>()
         );
+    }
+
+    #[test]
+    fn a_drive_that_is_stopped_keeps_the_seeds_that_were_driven() {
+        struct Stopping(usize);
+        impl Observer<Progress> for Stopping {
+            fn observe(&mut self, _: Progress) -> Result<()> {
+                self.0 -= 1;
+                if self.0 == 0 { Err(Error::Interrupted) } else { Ok(()) }
+            }
+        }
+        impl<'a> Observer<DriveEvent<'a>> for Stopping {
+            fn observe(&mut self, event: DriveEvent) -> Result<()> {
+                match event {
+                    DriveEvent::Begin { seed: 5, .. } => Err(Error::Interrupted),
+                    _ => Ok(()),
+                }
+            }
+        }
+        let track = Track::load("lake").unwrap();
+        let make = || -> Result<Box<dyn Driver>> { Ok(Box::new(Zero)) };
+        let options = DriveOptions { runs: 4, seed: 3, ..Default::default() };
+        let all = drive(&track, make, &options, &mut Unobserved).unwrap();
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+        let (far, stopped) = pool.install(|| drive_as_far(&track, make, &options, &mut Stopping(2))).unwrap();
+        assert!(stopped && far.trials == all.trials[..2] && far.summary.runs == 2 && far.summary.laps_total == 2);
+        let (far, stopped) = drive_observed_as_far(&track, make, &options, &mut Stopping(1)).unwrap();
+        assert!(stopped && far.trials == all.trials[..2]);
+        assert!(matches!(drive(&track, make, &options, &mut Stopping(4)), Err(Error::Interrupted)));
+        let from_5 = DriveOptions { seed: 5, ..options };
+        let nothing = drive_observed_as_far(&track, make, &from_5, &mut Stopping(1));
+        assert!(matches!(nothing, Err(Error::Interrupted)));
     }
 
     #[test]

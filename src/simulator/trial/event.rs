@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use crate::simulator::camera::pinhole::RgbFrame;
 use crate::simulator::car::simulation::Simulation;
-use crate::simulator::trial::outcome::TrialOptions;
+use crate::simulator::trial::outcome::{Trial, TrialOptions};
 
 /// One frame of a trial, after the driver has answered it and before the car moves.
 pub struct DriveFrame<'a> {
@@ -50,4 +50,6 @@ pub enum DriveEvent<'a> {
     },
     /// The driver has answered a frame.
     Frame(&'a DriveFrame<'a>),
+    /// The trial is over.
+    End(&'a Trial),
 }

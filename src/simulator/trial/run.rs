@@ -89,7 +89,11 @@ fn drive_run(
         }
         closed_loop.step();
     }
-    Ok(closed_loop.finish())
+    let trial = closed_loop.finish();
+    if let Some(observer) = &mut observer {
+        observer.observe(DriveEvent::End(&trial))?;
+    }
+    Ok(trial)
 }
 
 #[cfg(test)]

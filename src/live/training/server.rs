@@ -1,0 +1,62 @@
+//! Answers the requests of the page.
+
+use std::io::Write as _;
+use std::time::Duration;
+
+use super::Desk;
+use crate::net::connections::Peer;
+use crate::net::http::{self, Head};
+use crate::net::loopback::{self, Request};
+use crate::net::socket::Socket;
+use crate::text::escaped;
+
+/// The whole page.
+const PAGE: &str = include_str!("page.html");
+/// Headers of every answer: nothing comes from elsewhere, and no other page may show this one in a frame.
+const HEADERS: &str = "Content-Security-Policy: default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; \
+    img-src data:; connect-src 'self'; frame-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'self'\r\n\
+    X-Frame-Options: SAMEORIGIN\r\nX-Content-Type-Options: nosniff\r\nReferrer-Policy: no-referrer\r\n\
+    Cross-Origin-Resource-Policy: same-origin\r\nCache-Control: no-store\r\n";
+/// Time that a browser has to read the last bytes.
+const FAREWELL: Duration = Duration::from_millis(300);
+/// Longest time that a read blocks.
+const TICK: Duration = Duration::from_millis(40);
+
+/// Answers one request. An error ends the connection; there is no one to tell.
+pub(super) fn serve(peer: &Peer, port: u16, desk: &Desk) -> std::io::Result<()> {
+    let mut socket = Socket::new(peer.stream.try_clone()?, TICK)?;
+    let response = match loopback::read_request(&mut socket, &|| desk.is_over())? {
+        None => return Ok(()),
+        Some(Request::Bad(response)) => response,
+        Some(Request::Head(bytes)) => {
+            let head = Head::parse(&bytes).ok().flatten().expect("it was read as a whole request");
+            answer(&head, port, desk)
+        }
+    };
+    socket.write_all(response.as_bytes())?;
+    socket.finish(FAREWELL);
+    Ok(())
+}
+
+/// The response to a request.
+fn answer(head: &Head, port: u16, desk: &Desk) -> String {
+    let host = match loopback::own_host(head, port) {
+        Ok(host) => host,
+        Err(response) => return response,
+    };
+    if !loopback::is_own_page(head, host) {
+        return http::plain("403 Forbidden", "only the page that is served here may ask");
+    }
+    let ok = |content_type: &str, body: &str| http::response("200 OK", content_type, HEADERS, body);
+    let path = head.target.split('?').next().unwrap_or("");
+    match (head.method, path) {
+        ("GET", "/") => ok("text/html; charset=utf-8", PAGE),
+        ("GET", "/state") => ok("application/json", &desk.state()),
+        ("GET", "/report") => match desk.report() {
+            Ok(html) => ok("text/html; charset=utf-8", &html),
+            Err(error) => http::plain("500 Internal Server Error", &escaped(&error.to_string())),
+        },
+        ("GET", _) => http::plain("404 Not Found", "there is one page here, /"),
+        _ => http::plain("405 Method Not Allowed\r\nAllow: GET", "only GET is understood here"),
+    }
+}
