@@ -37,5 +37,5 @@ pub use history::{EpochRecord, read_history};
 pub use pace::{Pace, PaceNow};
 pub use profile::ProfileReport;
 pub use request::{TrainRequest, TrainResult, TrainingEvent};
-pub(crate) use run_folder::{RunFolder, RunInfo};
+pub(crate) use run_folder::{NewRun, RunFolder, RunInfo};
 pub use transfer::TransferRequest;
