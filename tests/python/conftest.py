@@ -45,6 +45,13 @@ def model(run):
 
 
 @pytest.fixture(scope="session")
+def driven(model, tmp_path_factory):
+    """A drive of the model on the lake, seed 5 at 30 mph, and the folder with its trajectories."""
+    folder = tmp_path_factory.mktemp("drives") / "lake"
+    return steersman.drive(model, "lake", runs=1, seed=5, speed_mph=30, out=folder, progress=False), folder
+
+
+@pytest.fixture(scope="session")
 def steersman_program():
     """Runs the command line: arguments in, (exit code, standard output, standard error) out."""
     binary = os.environ.get("STEERSMAN_BINARY")

@@ -57,5 +57,5 @@ def test_types_are_consistent(tmp_path):
         "drive: steersman.Drive = steersman.drive(model, 'lake')\n"
         "env = steersman.Simulator('lake')\n"
     )
-    out, err, code = api.run(["--strict", "--ignore-missing-imports", str(tmp_path / "user.py")])
+    out, err, code = api.run(["--strict", "--ignore-missing-imports", "--cache-dir", str(tmp_path), str(tmp_path / "user.py")])
     assert code == 0, out + err

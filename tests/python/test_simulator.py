@@ -10,7 +10,7 @@ import steersman
 
 
 def test_an_episode_with_the_expert_is_the_drive_of_the_expert():
-    simulator = steersman.Simulator("lake")
+    simulator = steersman.Simulator("lake", speed_mph=30)
     image, info = simulator.reset(seed=3)
     assert image.shape == (160, 320, 3) and image.dtype == np.uint8
     track = [(info["x_m"], info["y_m"], info["speed_mph"])]
@@ -21,20 +21,20 @@ def test_an_episode_with_the_expert_is_the_drive_of_the_expert():
         track.append((info["x_m"], info["y_m"], info["speed_mph"]))
     assert not truncated and info["failure"] is None and info["progress_m"] >= simulator.length_m
     assert total == pytest.approx(info["progress_m"])
-    (free,) = steersman.drive("expert", "lake", runs=1, seed=3, progress=False).free
+    (free,) = steersman.drive("expert", "lake", runs=1, seed=3, speed_mph=30, progress=False).free
     assert np.array_equal(np.array(track[: len(free.x_m)]), np.stack([free.x_m, free.y_m, free.speed_mph], axis=1))
 
 
-def test_a_model_steers_by_the_image_as_in_a_drive(model):
-    simulator = steersman.Simulator("coast", speed_mph=15)
-    image, _ = simulator.reset(seed=2)
+def test_a_model_steers_by_the_image_as_in_a_drive(model, driven):
+    simulator = steersman.Simulator("lake", speed_mph=30)
+    image, _ = simulator.reset(seed=5)
+    (free,) = driven[0].free
+    count = min(40, len(free.steering))
     steering = []
-    for _ in range(40):
+    for _ in range(count):
         steering.append(model.steer(image))
         image, *_ = simulator.step(steering[-1])
-    (free,) = steersman.drive(model, "coast", runs=1, seed=2, speed_mph=15, progress=False).free
-    count = min(40, len(free.steering))
-    assert count > 10 and np.array_equal(np.clip(steering[:count], -1, 1), free.steering[:count])
+    assert count > 10 and np.array_equal(np.clip(steering, -1, 1), free.steering[:count])
 
 
 def test_failures_end_an_episode_and_cost():

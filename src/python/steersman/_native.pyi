@@ -1,6 +1,7 @@
 """The extension module, written in Rust."""
 
 import os
+from pathlib import Path
 from typing import Any, Callable, Dict, List, Optional, Sequence, Tuple, Union
 
 import numpy as np
@@ -15,7 +16,7 @@ class Model:
     lock, positive to the right, and not clamped. All threads may use the same model; calls of :meth:`steer` wait for each other.
     """
 
-    path: str
+    path: Path
     """The model file."""
     outputs: Tuple[str, ...]
     """What the network gives, in the order of :meth:`predict_outputs`: ``("steering",)``, or ``"throttle"`` or ``"speed"`` behind it."""
@@ -99,7 +100,7 @@ class Recording:
     Rows that cannot be used are left out and counted in ``unusable``. Arrays are copies with an entry for each row.
     """
 
-    path: str
+    path: Path
     kind: str
     """Name of the format."""
     steering: NDArray[np.float32]
@@ -144,7 +145,7 @@ class Recording:
         """The images at ``rows``, of all rows by default: uint8 ``(n, height, width, 3)``. They must have the same size. A row of
         320x160 pixels takes 150 KiB."""
 
-    def image_path(self, row: int, camera: str = "centre") -> Optional[str]:
+    def image_path(self, row: int, camera: str = "centre") -> Optional[Path]:
         """Path of the image file, if there is one."""
 
 class Simulation:
@@ -171,7 +172,7 @@ class Simulation:
 _Progress = Optional[Callable[[Dict[str, Any]], Any]]
 _Path = Union[str, "os.PathLike[str]"]
 
-def train(recordings: Sequence[_Path], settings: Dict[str, Any], progress: _Progress = None) -> str: ...
+def train(recordings: Sequence[_Path], settings: Dict[str, Any], progress: _Progress = None) -> Path: ...
 def resume(folder: _Path, threads: int = 0, progress: _Progress = None) -> None: ...
 def read_run(folder: _Path) -> Dict[str, Any]: ...
 def trajectory_columns() -> List[str]: ...
