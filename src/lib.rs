@@ -10,16 +10,16 @@
 //! | [`engine`] | [layers](engine::layers) with their backward passes, [networks](engine::network) and the plans that run them, the [optimizer](engine::optimizer) |
 //! | [`training`] | goes through the epochs and writes the run folder |
 //! | [`model_file`], [`pilot`] | what remains of a run; a model that steers |
-//! | [`metrics`], [`simulator`], [`replay`] | how well a model predicts; how well it drives on a track, and on a recording |
+//! | [`evaluation`], [`simulator`], [`replay`] | how well a model predicts; how well it drives on a track, and on a recording |
 //! | [`geometry`] | camera and car of a recording, the driven path, views from beside it |
 //! | [`report`], [`live`], [`coach`] | pages, pictures and films; a drive in the browser; cleaning a recording there |
 //! | [`serve`], [`udacity`], [`simulator_client`] | drives Udacity's simulator; its messages; our simulator in its place |
 //! | [`exchange`] | models of other programs in, ours out for them |
-//! | [`main_job`], [`cli`] | what `train` does without a recording; the command line |
+//! | [`main_job`], [`cli`], `python` | what `train` does without a recording; the command line; the Python package |
 //!
-//! Dependencies point one way, from the command line down to `steersman-kernels`, which holds all vector code and every `unsafe`
-//! line; `tests/rooms.rs` states the order and keeps it. Below the rooms of the table lie `error`, `text`, `observer`, `picture`,
-//! `files` and `net`, which any of them may use. The [glossary](#glossary) at the end explains the words.
+//! Dependencies point one way, from the Python package and the command line down to `steersman-kernels`, which holds all vector code
+//! and every `unsafe` line; `tests/rooms.rs` states the order and keeps it. Below the rooms of the table lie `error`, `text`, `observer`,
+//! `picture`, `metrics`, `files` and `net`, which any of them may use. The [glossary](#glossary) at the end explains the words.
 //!
 //! # Three promises
 //!
@@ -175,6 +175,8 @@ pub mod coach;
 pub mod dataset;
 pub mod engine;
 pub mod error;
+#[cfg(feature = "training")]
+pub mod evaluation;
 #[cfg(feature = "exchange")]
 pub mod exchange;
 #[cfg(feature = "training")]
@@ -197,6 +199,8 @@ pub mod observer;
 pub mod picture;
 #[cfg(feature = "training")]
 pub mod pilot;
+#[cfg(feature = "python")]
+mod python;
 #[cfg(feature = "training")]
 pub mod recipe;
 #[cfg(feature = "training")]

@@ -5,7 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 /// The top-level rooms. A room may use those above it.
-const ROOMS: [&str; 30] = [
+const ROOMS: [&str; 32] = [
     "error",
     "suggestion",
     "text",
@@ -25,6 +25,7 @@ const ROOMS: [&str; 30] = [
     "model_file",
     "training",
     "pilot",
+    "evaluation",
     "simulator",
     "report",
     "exchange",
@@ -34,6 +35,7 @@ const ROOMS: [&str; 30] = [
     "coach",
     "main_job",
     "cli",
+    "python",
     "lib",
     "main",
 ];

@@ -153,8 +153,14 @@ pub fn run(args: DriveArgs) -> Result<()> {
             });
         }
     };
-    let options =
-        DriveOptions { laps: args.laps, runs: args.runs, seed: args.seed, speed: args.aimed_at()?, latency_ms, noise };
+    let options = DriveOptions {
+        laps: args.laps,
+        runs: args.runs,
+        seed: args.seed,
+        speed: args.throttle.aimed_at(args.speed)?,
+        latency_ms,
+        noise,
+    };
     if let Some((swept, values)) = swept {
         return drive_sweep::run(&args, &track, &options, swept, values);
     }
@@ -242,18 +248,6 @@ pub(super) fn stop_or_ok(stopped: bool) -> Result<()> {
 }
 
 impl DriveArgs {
-    /// The speed that `--speed` and `--throttle` ask for.
-    fn aimed_at(&self) -> Result<Speed> {
-        match (self.throttle, self.speed) {
-            (Throttle::Hold, speed) => Ok(speed.unwrap_or(Speed::Fixed(20.0))),
-            (Throttle::Model, None) => Ok(Speed::Driver(30.0)),
-            (Throttle::Model, Some(Speed::Fixed(mph))) => Ok(Speed::Driver(mph)),
-            (Throttle::Model, Some(_)) => Err(Error::Usage(
-                "--throttle model does not go with --speed auto: give the highest speed in mph".into(),
-            )),
-        }
-    }
-
     /// Who is called `name`, and gives what `--throttle` asks for.
     pub(super) fn wheel(&self, name: &str) -> Result<Wheel> {
         let wheel = Wheel::find(name)?;

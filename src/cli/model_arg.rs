@@ -20,7 +20,7 @@ const HDF5: &[u8] = b"\x89HDF\r\n\x1a\n";
 /// # Errors
 ///
 /// [`Error::Usage`] that says what to do, for a recording, a recipe, a Keras model and other things that are no model.
-pub(super) fn model_file(given: &Path) -> Result<PathBuf> {
+pub(crate) fn model_file(given: &Path) -> Result<PathBuf> {
     let wrong = |what: String| Err(Error::Usage(format!("{}: {what}", given.display())));
     let metadata = match std::fs::metadata(given) {
         Ok(metadata) => metadata,

@@ -5,9 +5,9 @@ use std::path::PathBuf;
 use clap::Args;
 use serde::Serialize;
 
-use super::far_outputs::notice_far_outputs;
 use super::{end_with, load_pilot, print, print_json};
 use crate::error::{Error, Result};
+use crate::evaluation::far_steering_notice;
 use crate::pilot::Answer;
 
 /// Print what a model gives for images: the steering, and throttle or speed if it has such an output
@@ -65,7 +65,7 @@ pub fn run(args: PredictArgs) -> Result<()> {
         }
     }
     let given = || answers.iter().filter_map(|row| row.steering);
-    notice_far_outputs(given());
+    far_steering_notice(given()).iter().for_each(|notice| eprintln!("{notice}"));
     if args.json {
         print_json(&answers)?;
     }

@@ -1,6 +1,6 @@
 //! `steersman summary`: the layer table.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 use serde::Serialize;
@@ -73,14 +73,18 @@ impl Table {
 }
 
 pub fn run(args: SummaryArgs) -> Result<()> {
-    let mut heading = String::new();
-    let recipe = match &args.model {
+    let (recipe, text) = match &args.model {
         Some(path) => {
             let model = load_model(path)?;
-            heading = format!("model {}\n{}", path.display(), about(&model));
-            model.recipe
+            let text = of_model(path, &model)?;
+            (model.recipe, text)
         }
-        None => args.recipe.find()?,
+        None => {
+            let recipe = args.recipe.find()?;
+            let table = recipe.network(Isa::best())?.summary();
+            let text = format!("{}: {}\n\n{table}", recipe.name, recipe.about);
+            (recipe, text)
+        }
     };
     let network = recipe.network(Isa::best())?;
     if let Some(path) = &args.svg {
@@ -93,10 +97,17 @@ pub fn run(args: SummaryArgs) -> Result<()> {
     if args.json {
         return print_json(&Table::of(&recipe, &network));
     }
-    if heading.is_empty() {
-        heading = format!("{}: {}\n", recipe.name, recipe.about);
-    }
-    print(&format!("{heading}\n{}", network.summary()))
+    print(&text)
+}
+
+/// The text for the model that was read from `path`.
+///
+/// # Errors
+///
+/// [`Error::Network`](crate::Error::Network) if its layers do not fit.
+pub(crate) fn of_model(path: &Path, model: &Model) -> Result<String> {
+    let table = model.recipe.network(Isa::best())?.summary();
+    Ok(format!("model {}\n{}\n{table}", path.display(), about(model)))
 }
 
 /// Recipe and training of a model, a line each.

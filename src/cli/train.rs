@@ -27,7 +27,7 @@ use crate::recipe::Recipe;
 use crate::replay::RecordingVerdict;
 use crate::report;
 use crate::text::percent;
-use crate::training::{self, RunFolder, TrainRequest, TrainResult, TransferRequest};
+use crate::training::{self, NewRun, RunFolder, TrainRequest, TrainResult, TransferRequest};
 
 /// Time of one core (Zen 3, 2.4 GHz) for recording and for driving, s.
 const SIMULATOR_CORE_S: f64 = 160.0;
@@ -152,10 +152,11 @@ pub fn run(args: TrainArgs) -> Result<()> {
             None => {
                 let recipe = recipe()?;
                 eprintln!("{}", plan(&recipe, &scope, args.dagger, pool.current_num_threads())?);
-                let (out, claimed) = out_or_next(args.out, &recipe.name)?;
+                let run = NewRun::at(args.out, &recipe.name)?;
+                let out = run.path().to_path_buf();
                 let (seed, cache_mib, algorithm) = (args.seed, args.cache, args.algorithm);
                 let request = JobRequest { recipe, out, seed, cache_mib, from, algorithm };
-                claimed.settle(pool.install(|| job.begin(request)))
+                run.settle(pool.install(|| job.begin(request)))
             }
         };
         let folder = job.folder().map(Path::to_path_buf);
@@ -214,7 +215,8 @@ pub fn run(args: TrainArgs) -> Result<()> {
                 }
                 None => Vec::new(),
             };
-            let (out, claimed) = out_or_next(args.out, &recipe.name)?;
+            let run = NewRun::at(args.out, &recipe.name)?;
+            let out = run.path().to_path_buf();
             let request = TrainRequest {
                 recordings,
                 validate,
@@ -240,7 +242,7 @@ pub fn run(args: TrainArgs) -> Result<()> {
                 }
                 result
             };
-            let result = claimed.settle(noted.and_then(|()| pool.install(train)));
+            let result = run.settle(noted.and_then(|()| pool.install(train)));
             (out, note, result)
         }
     };
@@ -332,32 +334,6 @@ fn plan(recipe: &Recipe, scope: &Scope, dagger_rounds: u32, threads: usize) -> R
         counted(scope.tracks.len(), "track"),
         counted(threads, "thread"),
     ))
-}
-
-/// A folder that was created for a run, if it was.
-struct Claimed(Option<PathBuf>);
-
-impl Claimed {
-    /// Removes the folder if the run ended before it had put anything there, and `runs/` if it was made for it.
-    fn settle<T>(self, result: Result<T>) -> Result<T> {
-        if let (Err(_), Some(path)) = (&result, &self.0) {
-            // A folder with something in it stays; so does `runs/` with other runs in it.
-            let _ = std::fs::remove_dir(path);
-            let _ = path.parent().map(std::fs::remove_dir);
-        }
-        result
-    }
-}
-
-/// The folder that the user named, or a new one under `runs/` for a recipe `name`.
-fn out_or_next(out: Option<PathBuf>, name: &str) -> Result<(PathBuf, Claimed)> {
-    match out {
-        Some(out) => Ok((out, Claimed(None))),
-        None => {
-            let out = RunFolder::create_next(name)?;
-            Ok((out.clone(), Claimed(Some(out))))
-        }
-    }
 }
 
 /// Writes the page of the finished run in `folder`. The run is saved; a page that cannot be written takes nothing from it.

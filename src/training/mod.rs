@@ -17,21 +17,25 @@
 //! | `result.json` | what `train --json` prints; its presence says that the run is finished |
 
 mod averaged;
+mod begin;
 mod checkpoint;
 mod data;
 mod history;
+mod outcome;
 mod pace;
 mod profile;
+mod request;
 mod run;
 mod run_folder;
 mod transfer;
 mod validation;
 
 pub use crate::engine::loss::Loss;
+pub use begin::{resume, resume_with, train};
 pub(crate) use data::Data;
 pub use history::{EpochRecord, read_history};
 pub use pace::{Pace, PaceNow};
 pub use profile::ProfileReport;
-pub use run::{TrainRequest, TrainResult, TrainingEvent, resume, resume_with, train};
-pub(crate) use run_folder::{RunFolder, RunInfo};
+pub use request::{TrainRequest, TrainResult, TrainingEvent};
+pub(crate) use run_folder::{NewRun, RunFolder, RunInfo};
 pub use transfer::TransferRequest;

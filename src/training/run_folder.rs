@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use steersman_kernels::conv::ConvAlgorithm;
 
 use super::history::{EpochRecord, history_csv, read_history};
-use super::run::TrainResult;
+use super::request::TrainResult;
 use crate::dataset::Description;
 use crate::error::{Error, Result};
 use crate::files::lock::{LOCK_NAME, Lock};
@@ -20,6 +20,43 @@ use crate::replay::RecordingVerdict;
 #[derive(Clone, Debug)]
 pub(crate) struct RunFolder {
     path: PathBuf,
+}
+
+/// The folder of a run that is about to begin.
+#[derive(Debug)]
+pub(crate) struct NewRun {
+    path: PathBuf,
+    /// Whether it was made just now.
+    made: bool,
+}
+
+impl NewRun {
+    /// The folder `out` that the user named, or a new one under `runs/` for a recipe `name`.
+    ///
+    /// # Errors
+    ///
+    /// As [`RunFolder::create_next`].
+    pub fn at(out: Option<PathBuf>, name: &str) -> Result<NewRun> {
+        match out {
+            Some(path) => Ok(NewRun { path, made: false }),
+            None => Ok(NewRun { path: RunFolder::create_next(name)?, made: true }),
+        }
+    }
+
+    /// The folder.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Removes the folder if it was made here and the run ended before it had put anything there, and `runs/` if that was made for it.
+    pub fn settle<T>(self, result: Result<T>) -> Result<T> {
+        if result.is_err() && self.made {
+            // A folder with something in it stays; so does `runs/` with other runs in it.
+            let _ = std::fs::remove_dir(&self.path);
+            let _ = self.path.parent().map(std::fs::remove_dir);
+        }
+        result
+    }
 }
 
 /// The lock of a run folder. It ends with its process, however that ends.

@@ -10,31 +10,48 @@ use super::{Network, Parameters};
 use crate::engine::layers::{BatchStatistics, Grads, Pair, Pass};
 use crate::engine::loss::Loss;
 
+/// The stages of a network, and what they need in every step.
+#[derive(Debug)]
+pub(super) struct StagePlan {
+    pub stages: Vec<FusedStage>,
+    /// The packed weights of each stage, made anew in every step.
+    pub packed: Vec<Vec<f32>>,
+    /// Where the means and variances of each stage lie among those of all.
+    pub moments_of: Vec<Range<usize>>,
+    /// The first stage that learns: no gradient is computed before it.
+    pub first_learning: usize,
+    /// Weight of each output in the loss; empty for 1 / outputs each.
+    pub output_weights: Vec<f32>,
+    pub times: StepTimes,
+}
+
 /// What all shards share during a pass of a training step.
 #[derive(Clone, Copy)]
 pub(super) struct StepContext<'a> {
+    pub plan: &'a StagePlan,
     pub network: &'a Network,
     pub parameters: &'a Parameters,
-    pub stages: &'a [FusedStage],
-    pub packed: &'a [Vec<f32>],
+    /// Means and variances of the batch, all stages one after the other.
     pub moments: &'a [f32],
-    pub moments_of: &'a [Range<usize>],
-    pub first_learning: usize,
-    /// Weight of each output in the loss; empty for 1 / outputs each.
-    pub output_weights: &'a [f32],
     pub input: StepSlices<'a>,
-    pub times: &'a StepTimes,
 }
 
 impl<'a> StepContext<'a> {
     fn pass(&self, stage: usize, first_image: usize) -> Pass<'a> {
-        let moments = &self.moments[self.moments_of[stage].clone()];
-        let layer = self.stages[stage].layers.start;
-        Pass { seed: self.input.seed, step: self.input.step, layer, first_image, moments, packed: &self.packed[stage] }
+        let moments = &self.moments[self.plan.moments_of[stage].clone()];
+        let layer = self.plan.stages[stage].layers.start;
+        Pass {
+            seed: self.input.seed,
+            step: self.input.step,
+            layer,
+            first_image,
+            moments,
+            packed: &self.plan.packed[stage],
+        }
     }
 
     fn params(&self, stage: usize) -> &'a [f32] {
-        &self.parameters.values[self.stages[stage].params(self.network)]
+        &self.parameters.values[self.plan.stages[stage].params(self.network)]
     }
 
     /// The input of `stage` for `images` of the batch; `first` is the image whose activations come first in the buffers.
@@ -48,8 +65,8 @@ impl<'a> StepContext<'a> {
     where
         'a: 'b,
     {
-        let len = self.stages[stage].input_len(self.network);
-        match self.stages[stage].source {
+        let len = self.plan.stages[stage].input_len(self.network);
+        match self.plan.stages[stage].source {
             Some(source) => &activations[source][(images.start - first) * len..][..images.len() * len],
             None => &self.input.x[images.start * len..images.end * len],
         }
@@ -57,14 +74,14 @@ impl<'a> StepContext<'a> {
 
     pub fn forward(&self, stages: Range<usize>, shard: &mut Shard, images: Range<usize>) {
         for index in stages {
-            let stage = &self.stages[index];
+            let stage = &self.plan.stages[index];
             let (before, from_here) = shard.buffers.activations.split_at_mut(index);
             let x = self.stage_input(index, before, shard.first, images.clone());
             let (n, offset) = (images.len(), images.start - shard.first);
             let outputs = stage.output_len(self.network);
             let y = &mut from_here[0][offset * outputs..][..n * outputs];
             let (params, pass) = (self.params(index), self.pass(index, images.start));
-            self.times.stages[index][0].time(|| match &stage.kind {
+            self.plan.times.stages[index][0].time(|| match &stage.kind {
                 Kind::Layer => {
                     let layer = &self.network.layers()[stage.layers.start].layer;
                     layer.forward(params, &pass, n, x, y, &mut shard.scratch);
@@ -90,7 +107,7 @@ impl<'a> StepContext<'a> {
         let count = self.loss_count();
         let scale = 1.0 / count as f32;
         let gradient = &mut shard.buffers.d_output[..predictions.len()];
-        let weights = self.output_weights;
+        let weights = &self.plan.output_weights[..];
         shard.loss += match weights {
             [] => loss.value_and_gradient(predictions, labels, scale, gradient),
             _ => loss.weighted_value_and_gradient(predictions, labels, weights, scale, gradient),
@@ -106,22 +123,22 @@ impl<'a> StepContext<'a> {
     /// What the sum of the losses of the batch is divided by: the number of labels, or of images if the outputs have weights.
     pub fn loss_count(&self) -> usize {
         let labels = self.input.labels.len();
-        if self.output_weights.is_empty() { labels } else { labels / self.output_weights.len() }
+        if self.plan.output_weights.is_empty() { labels } else { labels / self.plan.output_weights.len() }
     }
 
     /// Backward pass of `stages`: from the gradient of the last one's output to that of the first one's input.
     pub fn backward(&self, stages: Range<usize>, shard: &mut Shard, images: Range<usize>) {
-        for index in stages.rev().filter(|index| *index >= self.first_learning) {
-            let stage = &self.stages[index];
+        for index in stages.rev().filter(|index| *index >= self.plan.first_learning) {
+            let stage = &self.plan.stages[index];
             let n = images.len();
             let offset = images.start - shard.first;
             let place = |len: usize| offset * len..(offset + n) * len;
             let (of_x, of_y) = (place(stage.input_len(self.network)), place(stage.output_len(self.network)));
             let (params, pass) = (self.params(index), self.pass(index, images.start));
-            let replaces = stage.source.filter(|_| replaces_input(self.network, self.stages, index));
+            let replaces = stage.source.filter(|_| replaces_input(self.network, &self.plan.stages, index));
             // No stage needs the gradient of the images, or of the outputs before the first stage that learns.
-            let wanted = stage.source.filter(|source| *source >= self.first_learning);
-            self.times.stages[index][1].time(|| match &stage.kind {
+            let wanted = stage.source.filter(|source| *source >= self.plan.first_learning);
+            self.plan.times.stages[index][1].time(|| match &stage.kind {
                 Kind::NormRectify(fused) => {
                     let source = replaces.expect("batch norm runs fused only after another stage");
                     let (in_place, d_output) = (shard.buffers.in_place, std::mem::take(&mut shard.buffers.d_output));
@@ -168,13 +185,13 @@ impl<'a> StepContext<'a> {
     pub fn forward_sums(&self, stage: usize, barrier: &dyn BatchStatistics, shard: &mut Shard, images: Range<usize>) {
         let x = self.stage_input(stage, &shard.buffers.activations, shard.first, images.clone());
         let sums = &mut shard.group_sums[..barrier.sums_len()];
-        self.times.stages[stage][0].time(|| barrier.forward_sums(images.len(), x, sums));
+        self.plan.times.stages[stage][0].time(|| barrier.forward_sums(images.len(), x, sums));
         shard.add_group_sums(barrier.sums_len());
     }
 
     /// Adds the backward sums of the barrier over `images` to the shard's.
     pub fn backward_sums(&self, index: usize, barrier: &dyn BatchStatistics, shard: &mut Shard, images: Range<usize>) {
-        let stage = &self.stages[index];
+        let stage = &self.plan.stages[index];
         let n = images.len();
         let x = self.stage_input(index, &shard.buffers.activations, shard.first, images.clone());
         let outputs = stage.output_len(self.network);
@@ -187,7 +204,7 @@ impl<'a> StepContext<'a> {
         let sums = &mut shard.group_sums[..barrier.sums_len()];
         let moments = self.pass(index, images.start).moments;
         let dparams = &mut shard.gradient[stage.params(self.network)];
-        self.times.stages[index][1].time(|| match &stage.kind {
+        self.plan.times.stages[index][1].time(|| match &stage.kind {
             Kind::Layer | Kind::PooledConv(_) => barrier.backward_sums(moments, n, x, dy, sums, dparams),
             Kind::NormRectify(fused) => fused.backward_sums(self.params(index), moments, x, dy, sums, dparams),
         });

@@ -15,7 +15,7 @@ use rayon::prelude::*;
 use steersman_kernels::{Isa, update};
 
 use super::fused::{FusedStage, replaces_input, stages};
-use super::passes::StepContext;
+use super::passes::{StagePlan, StepContext};
 use super::shard::{Buffers, Shard, Spare, groups, total};
 use super::step_input::{StepInput, StepSlices};
 use super::step_profile::{StageTime, StepTimes};
@@ -59,29 +59,20 @@ pub struct TrainingPlan {
     gradient: Vec<f32>,
     /// Sum of squares of each chunk of the gradient.
     chunk_squares: Vec<f64>,
-    stages: Vec<FusedStage>,
-    /// The packed weights of each stage, made anew in every step.
-    packed: Vec<Vec<f32>>,
+    plan: StagePlan,
     /// Means and variances of the batch from the barriers, all stages one after the other.
     moments: Vec<f32>,
-    /// Where each stage's part of `moments` lies.
-    moments_of: Vec<Range<usize>>,
     sums: Vec<f64>,
     /// Runs of stages without a barrier inside; each but the first begins with the stage that needs the barrier.
     segments: Vec<Range<usize>>,
     /// Size of a group in each segment.
     segment_groups: Vec<usize>,
-    /// The first stage that learns: no gradient is computed before it.
-    first_learning: usize,
-    /// Weight of each output in the loss; empty for 1 / outputs each.
-    output_weights: Vec<f32>,
     capacity: usize,
     /// Outputs of the network.
     outputs: usize,
     isa: Isa,
     /// [`Network::fingerprint`] of the network it was planned for.
     fingerprint: u64,
-    times: StepTimes,
 }
 
 impl TrainingPlan {
@@ -157,17 +148,19 @@ impl TrainingPlan {
             spare_scratch: Spare::new((0..capacity.min(MAX_SHARDS)).map(|_| vec![0.0; scratch_len]).collect()),
             gradient: vec![0.0; network.count(true)],
             chunk_squares: vec![0.0; network.count(true).div_ceil(CHUNK)],
-            first_learning: stages.iter().position(|stage| stage.learns(network)).unwrap_or(stages.len()),
-            output_weights: Vec::new(),
-            times: StepTimes::off(stages.len()),
-            packed: stages
-                .iter()
-                .map(|stage| stage.packing(network).map_or(0, |packing| packing.training_packed_len()))
-                .map(|len| vec![0.0; len])
-                .collect(),
-            stages,
+            plan: StagePlan {
+                first_learning: stages.iter().position(|stage| stage.learns(network)).unwrap_or(stages.len()),
+                output_weights: Vec::new(),
+                times: StepTimes::off(stages.len()),
+                packed: stages
+                    .iter()
+                    .map(|stage| stage.packing(network).map_or(0, |packing| packing.training_packed_len()))
+                    .map(|len| vec![0.0; len])
+                    .collect(),
+                stages,
+                moments_of,
+            },
             moments: vec![0.0; moments_end],
-            moments_of,
             sums: vec![0.0; sums_len],
             segments,
             segment_groups,
@@ -184,9 +177,10 @@ impl TrainingPlan {
     /// # Panics
     ///
     /// Panics if there is not one weight for each output.
-    pub fn with_output_weights(self, weights: &[f32]) -> TrainingPlan {
+    pub fn with_output_weights(mut self, weights: &[f32]) -> TrainingPlan {
         assert_eq!(weights.len(), self.outputs, "a weight for each output of the network");
-        TrainingPlan { output_weights: weights.to_vec(), ..self }
+        self.plan.output_weights = weights.to_vec();
+        self
     }
 
     /// Gradient of the mean loss of the last step with respect to [`Parameters::values`].
@@ -206,12 +200,12 @@ impl TrainingPlan {
 
     /// Measures the time of each stage from now on; `reduce` gets the time of the reduction of the shards' gradients.
     pub fn measure(&mut self, reduce: Stopwatch) {
-        self.times = StepTimes::on(self.stages.len(), reduce);
+        self.plan.times = StepTimes::on(self.plan.stages.len(), reduce);
     }
 
     /// The times since [`measure`](TrainingPlan::measure), in the order of the layers.
     pub fn stage_times(&self, network: &Network) -> Vec<StageTime> {
-        StageTime::of(network, &self.stages, &self.times, self.first_learning)
+        StageTime::of(network, &self.plan.stages, &self.plan.times, self.plan.first_learning)
     }
 
     /// Computes the mean loss of the batch and writes its gradient to [`gradient`](TrainingPlan::gradient). Of the
@@ -248,7 +242,7 @@ impl TrainingPlan {
             self.backward_with_barriers(network, parameters, input, used);
         }
         self.reduce_gradient(network, used);
-        let count = input.labels.len() / self.output_weights.len().max(1);
+        let count = input.labels.len() / self.plan.output_weights.len().max(1);
         self.shards[..used].iter().map(|shard| shard.loss).sum::<f64>() / count as f64
     }
 
@@ -297,7 +291,7 @@ impl TrainingPlan {
 
     /// Packs the weights once for all shards.
     fn pack(&mut self, network: &Network, parameters: &Parameters) {
-        self.packed.par_iter_mut().zip(&self.stages).for_each(|(to, stage)| {
+        self.plan.packed.par_iter_mut().zip(&self.plan.stages).for_each(|(to, stage)| {
             if let Some(packing) = stage.packing(network) {
                 packing.pack_for_training(&parameters.values[stage.params(network)], to);
             }
@@ -306,7 +300,7 @@ impl TrainingPlan {
 
     /// The moments of frozen batch normalisation.
     fn freeze_moments(&mut self, network: &Network, parameters: &Parameters) {
-        for (stage, moments_of) in self.stages.iter().zip(&self.moments_of) {
+        for (stage, moments_of) in self.plan.stages.iter().zip(&self.plan.moments_of) {
             let layer = &network.layers()[stage.layers.start];
             if let Some(statistics) = stage.batch_statistics(network).filter(|_| layer.frozen) {
                 let params = &parameters.values[layer.params.clone()];
@@ -324,32 +318,8 @@ impl TrainingPlan {
         input: StepSlices,
         used: usize,
     ) {
-        let TrainingPlan {
-            shards,
-            spare_buffers,
-            spare_scratch,
-            stages,
-            packed,
-            moments,
-            moments_of,
-            first_learning,
-            output_weights,
-            times,
-            ..
-        } = self;
-        let first_learning = *first_learning;
-        let run = StepContext {
-            network,
-            parameters,
-            stages,
-            packed,
-            moments,
-            moments_of,
-            first_learning,
-            output_weights,
-            input,
-            times,
-        };
+        let TrainingPlan { shards, spare_buffers, spare_scratch, plan, moments, .. } = self;
+        let run = StepContext { plan, network, parameters, moments, input };
         shards[..used].par_iter_mut().for_each(|shard| {
             shard.reset();
             shard.buffers = spare_buffers.take();
@@ -360,9 +330,9 @@ impl TrainingPlan {
             }
             for images in groups(shard.images.clone(), group) {
                 shard.first = images.start;
-                run.forward(0..stages.len(), shard, images.clone());
+                run.forward(0..plan.stages.len(), shard, images.clone());
                 run.loss(loss, shard, images.clone());
-                run.backward(0..stages.len(), shard, images);
+                run.backward(0..plan.stages.len(), shard, images);
             }
             spare_buffers.put(std::mem::take(&mut shard.buffers));
             spare_scratch.put(std::mem::take(&mut shard.scratch));
@@ -378,39 +348,13 @@ impl TrainingPlan {
         input: StepSlices,
         used: usize,
     ) {
-        let TrainingPlan {
-            shards,
-            spare_scratch,
-            stages,
-            packed,
-            moments,
-            moments_of,
-            sums,
-            segments,
-            segment_groups,
-            first_learning,
-            output_weights,
-            times,
-            ..
-        } = self;
-        let first_learning = *first_learning;
+        let TrainingPlan { shards, spare_scratch, plan, moments, sums, segments, segment_groups, .. } = self;
         let shards = &mut shards[..used];
         let images = shards.last().map_or(0, |shard| shard.images.end);
-        let barrier = |stage: usize| barrier_of(stages, network, stage);
+        let barrier = |stage: usize| barrier_of(&plan.stages, network, stage);
         let wanted = segments.len() - usize::from(loss.is_none());
         for (index, segment) in segments[..wanted].iter().enumerate() {
-            let run = StepContext {
-                network,
-                parameters,
-                stages,
-                packed,
-                moments,
-                moments_of,
-                first_learning,
-                output_weights,
-                input,
-                times,
-            };
+            let run = StepContext { plan, network, parameters, moments, input };
             let next_barrier = segments.get(index + 1).map(|next| next.start);
             shards.par_iter_mut().for_each(|shard| {
                 if index == 0 {
@@ -429,13 +373,13 @@ impl TrainingPlan {
                 spare_scratch.put(std::mem::take(&mut shard.scratch));
             });
             if let Some(stage) = next_barrier {
-                let layer = &network.layers()[stages[stage].layers.start];
+                let layer = &network.layers()[plan.stages[stage].layers.start];
                 let sums = total(shards, barrier(stage).sums_len(), sums);
                 barrier(stage).finish_forward(
                     &parameters.values[layer.params.clone()],
                     images,
                     sums,
-                    &mut moments[moments_of[stage].clone()],
+                    &mut moments[plan.moments_of[stage].clone()],
                     &mut parameters.statistics[layer.statistics.clone()],
                 );
             }
@@ -443,39 +387,13 @@ impl TrainingPlan {
     }
 
     fn backward_with_barriers(&mut self, network: &Network, parameters: &Parameters, input: StepSlices, used: usize) {
-        let TrainingPlan {
-            shards,
-            spare_scratch,
-            stages,
-            packed,
-            moments,
-            moments_of,
-            sums,
-            segments,
-            segment_groups,
-            first_learning,
-            output_weights,
-            times,
-            ..
-        } = self;
-        let first_learning = *first_learning;
+        let TrainingPlan { shards, spare_scratch, plan, moments, sums, segments, segment_groups, .. } = self;
         let shards = &mut shards[..used];
         let images = shards.last().map_or(0, |shard| shard.images.end);
-        let barrier = |stage: usize| barrier_of(stages, network, stage);
+        let barrier = |stage: usize| barrier_of(&plan.stages, network, stage);
         let last = segments.len() - 1;
         for (index, segment) in segments.iter().enumerate().rev() {
-            let run = StepContext {
-                network,
-                parameters,
-                stages,
-                packed,
-                moments,
-                moments_of,
-                first_learning,
-                output_weights,
-                input,
-                times,
-            };
+            let run = StepContext { plan, network, parameters, moments, input };
             // The stage at the start of a segment waits for the sums over all shards.
             let rest = if index > 0 { segment.start + 1..segment.end } else { segment.clone() };
             shards.par_iter_mut().for_each(|shard| {
@@ -497,8 +415,8 @@ impl TrainingPlan {
             if index > 0 {
                 let stage = segment.start;
                 let sums = total(shards, barrier(stage).sums_len(), sums);
-                let params = &parameters.values[network.layers()[stages[stage].layers.start].params.clone()];
-                let moments = &mut moments[moments_of[stage].clone()];
+                let params = &parameters.values[network.layers()[plan.stages[stage].layers.start].params.clone()];
+                let moments = &mut moments[plan.moments_of[stage].clone()];
                 barrier(stage).finish_backward(params, images, sums, moments);
             }
         }
@@ -506,11 +424,11 @@ impl TrainingPlan {
 
     /// Adds the shards' gradients in the order of the shards. The gradients of frozen layers become 0.
     fn reduce_gradient(&mut self, network: &Network, used: usize) {
-        let TrainingPlan { shards, gradient, chunk_squares, isa, times, .. } = self;
+        let TrainingPlan { shards, gradient, chunk_squares, isa, plan, .. } = self;
         let shards = &shards[..used];
         gradient.par_chunks_mut(CHUNK).zip(chunk_squares.par_iter_mut()).enumerate().for_each(
             |(index, (chunk, squares))| {
-                times.reduce.time(|| {
+                plan.times.reduce.time(|| {
                     let range = index * CHUNK..index * CHUNK + chunk.len();
                     chunk.copy_from_slice(&shards[0].gradient[range.clone()]);
                     for shard in &shards[1..] {

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use super::drives::{self, DriveView};
 use super::html::Page;
+use super::layer_alignment::{LayerEntry, align};
 use super::run_list;
 use crate::error::{Error, Result};
 use crate::recipe::Recipe;
@@ -179,12 +180,13 @@ fn curves(runs: &[RunView], same_data: bool) -> Vec<String> {
 
 /// The entries that differ between the recipes, with the value in each run.
 fn differences(runs: &[RunView]) -> Result<(Vec<String>, Vec<Vec<String>>)> {
-    let mut tables = Vec::new();
+    let (mut tables, mut networks) = (Vec::new(), Vec::new());
     for run in runs {
         let text = run.recipe.to_toml()?;
         let table: toml::Table = text
             .parse()
             .map_err(|e: toml::de::Error| Error::Recipe { recipe: run.name.clone(), message: e.to_string() })?;
+        networks.push(layers(&table));
         let mut entries = BTreeMap::new();
         flatten("", &toml::Value::Table(table), &mut entries);
         tables.push(entries);
@@ -195,27 +197,38 @@ fn differences(runs: &[RunView]) -> Result<(Vec<String>, Vec<Vec<String>>)> {
     let values = |key: &String| -> Vec<String> {
         tables.iter().map(|table| table.get(key).cloned().unwrap_or_else(|| "-".into())).collect()
     };
+    let or_dash =
+        |cells: Vec<Option<String>>| cells.into_iter().map(|cell| cell.unwrap_or_else(|| "-".into())).collect();
+    let layers = align(&networks)
+        .into_iter()
+        .enumerate()
+        .map(|(at, cells)| (format!("layers, line {}", at + 1), or_dash(cells)));
     let differing: Vec<(String, Vec<String>)> = keys
         .into_iter()
         .filter(|key| key != "about")
         .map(|key| (key.clone(), values(&key)))
+        .chain(layers)
         .filter(|(_, values)| values.iter().any(|value| *value != values[0]))
         .collect();
     Ok(differing.into_iter().unzip())
 }
 
-/// `a.b = value` for every entry of a table; layers are numbered from 1 and stand in one line each.
+/// The layers of a recipe.
+fn layers(recipe: &toml::Table) -> Vec<LayerEntry> {
+    let entry = |layer: &toml::Value| LayerEntry {
+        kind: layer.get("kind").and_then(toml::Value::as_str).unwrap_or_default().into(),
+        text: layer.to_string().replace('\n', " "),
+    };
+    recipe.get("layers").and_then(toml::Value::as_array).map_or(Vec::new(), |layers| layers.iter().map(entry).collect())
+}
+
+/// `a.b = value` for every entry of a table but its layers.
 fn flatten(key: &str, value: &toml::Value, entries: &mut BTreeMap<String, String>) {
     match value {
-        toml::Value::Table(table) if !key.starts_with("layers") => {
-            for (name, value) in table {
+        toml::Value::Table(table) => {
+            for (name, value) in table.iter().filter(|(name, _)| !(key.is_empty() && *name == "layers")) {
                 let key = if key.is_empty() { name.clone() } else { format!("{key}.{name}") };
                 flatten(&key, value, entries);
-            }
-        }
-        toml::Value::Array(array) if key == "layers" => {
-            for (i, layer) in array.iter().enumerate() {
-                entries.insert(format!("layers {:02}", i + 1), layer.to_string().replace('\n', " "));
             }
         }
         value => {
@@ -270,6 +283,15 @@ mod tests {
         assert_eq!(keys, ["epochs", "name", "optimizer.learning_rate"]);
         assert_eq!(values[0], ["10", "3"]);
         assert!(differences(&runs[..1]).unwrap().0.is_empty());
+        let with_dropout = run("c", &[]);
+        let mut recipe = with_dropout.recipe.to_toml().unwrap();
+        let at = recipe.find("kind = \"flatten\"").unwrap();
+        let end = at + recipe[at..].find("[[layers]]").unwrap();
+        recipe.insert_str(end, "[[layers]]\nkind = \"dropout\"\ndrop_probability = 0.3\n\n");
+        let with_dropout = RunView { recipe: Recipe::parse("c", &recipe, &[]).unwrap(), ..with_dropout };
+        let (keys, values) = differences(&[run("a", &[]), with_dropout]).unwrap();
+        assert!(keys.len() == 1 && keys[0].starts_with("layers, line") && values[0][0] == "-", "{keys:?} {values:?}");
+        assert!(values[0][1].contains("dropout"));
     }
 
     #[test]

@@ -6,6 +6,7 @@ mod drives;
 pub mod explanation;
 pub mod html;
 pub mod inspection;
+mod layer_alignment;
 pub mod run;
 pub mod run_list;
 mod split_view;

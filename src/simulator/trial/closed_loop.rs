@@ -82,6 +82,11 @@ impl<'a> ClosedLoop<'a> {
         self.trial.interventions
     }
 
+    /// Why the trial ended early, if it did.
+    pub fn failure(&self) -> Option<Failure> {
+        self.trial.failure
+    }
+
     /// Share of the distance that is driven, 0 to 1.
     pub fn share(&self) -> f64 {
         (self.simulation.progress_m / self.distance_m).clamp(0.0, 1.0)

@@ -32,6 +32,11 @@ pub trait Driver {
         DriverAnswer { steering: self.steer(frame, state), pace: None }
     }
 
+    /// Whether the driver wants the trial to end at once, without a result.
+    fn gives_up(&self) -> bool {
+        false
+    }
+
     /// Whether `steer` looks at the picture; if not, none is taken.
     fn needs_frame(&self) -> bool {
         true

@@ -2,7 +2,6 @@
 
 use std::time::Instant;
 
-use crate::Result;
 use crate::observer::Observer;
 use crate::simulator::camera::front_camera::FrontCamera;
 use crate::simulator::camera::pinhole::RgbFrame;
@@ -13,11 +12,12 @@ use crate::simulator::trial::closed_loop::ClosedLoop;
 use crate::simulator::trial::driver::{DriveState, Driver};
 use crate::simulator::trial::event::{DriveEvent, DriveFrame};
 use crate::simulator::trial::outcome::{Trial, TrialOptions};
+use crate::{Error, Result};
 
 /// Drives one trial whose start, light and noise `seed` draws.
 ///
 /// # Errors
-/// If a picture cannot be encoded.
+/// If a picture cannot be encoded; [`Error::Interrupted`] if the driver gives up.
 pub fn run_trial(track: &Track, driver: &mut dyn Driver, options: &TrialOptions, seed: u64) -> Result<Trial> {
     drive_run(track, driver, options, seed, None)
 }
@@ -25,7 +25,7 @@ pub fn run_trial(track: &Track, driver: &mut dyn Driver, options: &TrialOptions,
 /// As [`run_trial`], to the same bits; `observer` is told every frame. Frames are rendered even if the driver does not look at them.
 ///
 /// # Errors
-/// If a picture cannot be encoded, or the observer's own.
+/// As [`run_trial`], and the observer's own.
 pub fn run_trial_observed(
     track: &Track,
     driver: &mut dyn Driver,
@@ -52,6 +52,9 @@ fn drive_run(
     }
     while closed_loop.goes_on() {
         if closed_loop.frame_is_due() {
+            if driver.gives_up() {
+                return Err(Error::Interrupted);
+            }
             let simulation = closed_loop.simulation();
             let speed_mph = telemetry_mph(simulation.car.speed_mps);
             let picture = match &mut eye {
@@ -154,6 +157,24 @@ mod tests {
         let plain = spread(options(false));
         assert!(spread(TrialOptions { latency_ms: 700.0, ..options(false) }) > 1.1 * plain);
         assert!(spread(TrialOptions { noise: 0.1, ..options(false) }) > 1.1 * plain);
+    }
+
+    #[test]
+    fn a_driver_that_gives_up_ends_the_trial_at_once() {
+        struct Tired(usize);
+        impl Driver for Tired {
+            fn steer(&mut self, _: &RgbFrame, state: &DriveState) -> f32 {
+                self.0 += 1;
+                expert::pursuit(state.simulation) as f32
+            }
+
+            fn gives_up(&self) -> bool {
+                self.0 == 7
+            }
+        }
+        let mut tired = Tired(0);
+        let ended = run_trial(&Track::load("lake").unwrap(), &mut tired, &options(false), 1);
+        assert!(matches!(ended, Err(crate::Error::Interrupted)) && tired.0 == 7);
     }
 
     #[test]
