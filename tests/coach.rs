@@ -51,22 +51,30 @@ fn rows_are_left_out_by_the_own_page_only_and_every_command_heeds_it() {
     assert_eq!((&about["rows"], &about["format"]), (&json!(ROWS), &json!("udacity")));
     assert_eq!(about["cameras"], json!(["centre", "left", "right"]));
     let own = format!("Origin: http://127.0.0.1:{}\r\nContent-Type: application/json\r\n", served.port);
-    let wanted = r#"{"revision":0,"stretches":[[10,20],[119,120]]}"#;
+    // No number of an earlier start.
+    let told: Value = serde_json::from_str(&get(&served, "/left-out").1).unwrap();
+    let revision = told["revision"].as_u64().unwrap();
+    assert!(revision > 1_700_000_000_000 && told["stretches"] == json!([]), "{told}");
+    let stretches =
+        |revision: u64, stretches: Value| json!({ "revision": revision, "stretches": stretches }).to_string();
+    let wanted = &stretches(revision, json!([[10, 20], [119, 120]]))[..];
     for (headers, body, status) in [
         ("", wanted, 403),
         ("Content-Type: application/json\r\n", wanted, 403),
         ("Origin: http://evil.example\r\nContent-Type: application/json\r\n", wanted, 403),
         (&own.replace("json", "x-www-form-urlencoded"), wanted, 403),
         (&own, "{", 400),
-        (&own, r#"{"revision":0,"stretches":[[10,121]]}"#, 400),
-        (&own, r#"{"revision":0,"stretches":[[10,10]]}"#, 400),
-        (&own, r#"{"revision":7,"stretches":[[10,20]]}"#, 409),
+        (&own, &stretches(revision, json!([[10, 121]])), 400),
+        (&own, &stretches(revision, json!([[10, 10]])), 400),
+        (&own, &stretches(revision + 7, json!([[10, 20]])), 409),
+        // A page of another recording, which was served here before.
+        (&own, &stretches(0, json!([[10, 20]])), 409),
     ] {
         assert_eq!(post(&served, headers, body).0, status, "{headers} {body}");
     }
-    assert_eq!(get(&served, "/left-out").1, r#"{"revision":0,"stretches":[]}"#);
+    assert_eq!(get(&served, "/left-out").1, stretches(revision, json!([])));
     let (status, told) = post(&served, &own, wanted);
-    assert_eq!((status, told.as_str()), (200, r#"{"revision":1,"stretches":[[10,20],[119,120]]}"#));
+    assert_eq!((status, told.as_str()), (200, &stretches(revision + 1, json!([[10, 20], [119, 120]]))[..]));
     for (request, status) in [
         ("GET / HTTP/1.1\r\nHost: evil.example\r\n\r\n", 403),
         ("GET /picture?row=0&camera=centre HTTP/1.1\r\nHost: localhost.evil.example\r\n\r\n", 403),
@@ -184,7 +192,7 @@ fn a_person_marks_undoes_reloads_and_training_obeys() {
 }
 
 #[test]
-fn a_hundred_thousand_rows_open_within_two_seconds() {
+fn a_hundred_thousand_rows_open_soon() {
     let folder = tempfile::tempdir().unwrap();
     let dir = folder.path();
     painted_log::write(&dir.join("log"), 4, "");
@@ -198,7 +206,7 @@ fn a_hundred_thousand_rows_open_within_two_seconds() {
     let took = began.elapsed();
     assert_eq!(columns, 100_000 * 20);
     println!("100,000 rows opened in {took:.2?}");
-    // Two seconds on a quiet machine.
+    // On a quiet machine it is one.
     assert!(took.as_secs() < 20, "{took:?}");
     assert_eq!(served.stop().0["left_out"], 0);
 }

@@ -82,7 +82,7 @@ fn training_learns_both_and_tells_the_errors_of_both() {
     let scratch = tempfile::tempdir().unwrap();
     let folder = scratch.path();
     for (outputs, out, figure) in [(THROTTLE, "throttle", "val_throttle_mae"), (SPEED, "speed", "val_speed_mae_mph")] {
-        let result = train(folder, &sample(), out, &[TWO_UNITS, outputs, "epochs=30", "balance.keep_zero=1.0"]);
+        let result = train(folder, &sample(), out, &[TWO_UNITS, outputs, "epochs=200", "balance.keep_zero=1.0"]);
         assert!(result[figure].is_number() && result["val_mae_deg"].is_number(), "{result}");
         let history = std::fs::read_to_string(folder.join(out).join("history.csv")).unwrap();
         assert!(history.lines().next().unwrap().contains(figure), "{history}");
@@ -91,8 +91,8 @@ fn training_learns_both_and_tells_the_errors_of_both() {
         let evaluated = json(folder, &["evaluate", out, sample().to_str().unwrap(), "--json"]);
         let beside = &evaluated[if out == "throttle" { "throttle" } else { "speed_mph" }];
         assert_eq!(beside["rows"], 24, "{evaluated}");
-        // Speeds of 19 to 21 mph, throttles of 0 to 0.2: after 30 epochs it is near them.
-        let (mae, near) = (beside["mae"].as_f64().unwrap(), if out == "throttle" { 0.2 } else { 6.0 });
+        // Speeds of 19 to 21 mph, throttles of 0.16: after 200 epochs it is nearer to them than to nothing.
+        let (mae, near) = (beside["mae"].as_f64().unwrap(), if out == "throttle" { 0.08 } else { 6.0 });
         assert!(mae < near, "{evaluated}");
         let predicted = json(folder, &["predict", out, picture().to_str().unwrap(), "--json"]);
         let answer = Pilot::load(&folder.join(out).join("model.safetensors")).unwrap().answer_file(&picture()).unwrap();

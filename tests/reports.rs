@@ -101,7 +101,7 @@ fn a_run_has_its_report_also_after_resume_and_runs_compare() {
     assert!(place("On the road") < place("lake: autonomy") && place("lake: autonomy") < place("Learning curves"));
     run(dir, &["compare", "a", "b", "--out", "c.html"]);
     let (text, _) = page(&dir.join("c.html"));
-    for part in ["optimizer.learning_rate", "autonomy", "from the line", "Validation MSE"] {
+    for part in ["optimizer.learning_<wbr/>rate", "autonomy", "from the line", "Validation MSE"] {
         assert!(text.contains(part), "{part}");
     }
     assert!(!text.contains("optimizer.beta1"), "what is the same is not listed");

@@ -43,14 +43,24 @@ pub fn run(args: &DriveArgs, track: &Track, options: &DriveOptions, swept: Swept
     let folder = args.out.as_deref().map(NewFolder::create).transpose()?;
     let stop = stop_on_ctrl_c()?;
     let pool = pool(args.threads)?;
-    let mut sweeps = Vec::new();
-    for (number, (wheel, driver)) in wheels.iter().zip(&drivers).enumerate() {
+    let (mut sweeps, mut ended) = (Vec::new(), false);
+    'all: for (number, (wheel, driver)) in wheels.iter().zip(&drivers).enumerate() {
         let mut points = Vec::new();
         for (value, options) in &drives {
             let value = *value;
             let name = format!("{driver}, {}", swept.value(value));
-            let (result, stopped) = pool.install(|| wheel.drive(track, options, &name, None, &stop))?;
-            stop_or_ok(stopped)?;
+            let result = match pool.install(|| wheel.drive(track, options, &name, None, &stop)) {
+                Ok((result, false)) => result,
+                // What is whole is kept.
+                Ok((_, true)) | Err(Error::Interrupted) => {
+                    ended = true;
+                    if !points.is_empty() {
+                        sweeps.push(Sweep { driver: driver.to_string(), swept, points });
+                    }
+                    break 'all;
+                }
+                Err(error) => return Err(error),
+            };
             if let Some(folder) = &folder {
                 let name = format!("{}{}", if number == 0 { "" } else { "against-" }, swept.value(value));
                 let of_value = NewFolder::create(&folder.unfinished().join(name.replace(' ', "-")))?;
@@ -61,13 +71,20 @@ pub fn run(args: &DriveArgs, track: &Track, options: &DriveOptions, swept: Swept
         }
         sweeps.push(Sweep { driver: driver.to_string(), swept, points });
     }
+    if sweeps.is_empty() {
+        return stop_or_ok(ended);
+    }
+    if ended {
+        let driven: usize = sweeps.iter().map(|sweep| sweep.points.len()).sum();
+        eprintln!("stopped after {driven} of {}", counted(drives.len() * wheels.len(), "value"));
+    }
     let saved = folder.map_or(Ok(()), |folder| save(track, &sweeps, folder));
     if args.json {
         print_json(&Report::of(track.name(), &sweeps[0], sweeps.get(1)))?;
     } else {
         print(&sweeps.iter().map(|sweep| table(track, args.runs, sweep)).collect::<Vec<_>>().join("\n"))?;
     }
-    saved
+    saved.and(stop_or_ok(ended))
 }
 
 /// The drives of a sweep, each with its value, from the smallest value to the largest.

@@ -79,7 +79,12 @@ impl TrainingDisplay {
 impl Observer<TrainingEvent> for TrainingDisplay {
     fn observe(&mut self, event: TrainingEvent) -> Result<()> {
         match event {
-            TrainingEvent::Begin { .. } => {}
+            // A job trains several times.
+            TrainingEvent::Begin { .. } => {
+                self.pace = Pace::default();
+                self.batch_losses.clear();
+                self.losses = Default::default();
+            }
             TrainingEvent::Notice(text) => self.print(&text),
             TrainingEvent::Batch { epoch, epochs, images, of, loss } => self.batch([epoch, epochs], images, of, loss),
             TrainingEvent::Epoch { record, of } => self.epoch(&record, of),

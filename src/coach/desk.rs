@@ -4,6 +4,7 @@ use std::ops::Range;
 use std::path::Path;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::{SystemTime, UNIX_EPOCH};
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -116,7 +117,7 @@ impl Desk {
             recording,
             exclusions,
             numbers,
-            left_out: Mutex::new(LeftOutRows { revision: 0, rows }),
+            left_out: Mutex::new(LeftOutRows { revision: first_revision(), rows }),
             models,
             suspicious: Mutex::default(),
             stop: StopSignal::default(),
@@ -213,12 +214,12 @@ impl Desk {
         }
         let mut rows = vec![false; count];
         wanted.stretches.iter().for_each(|&[first, end]| rows[first..end].fill(true));
-        let numbers = self.recording.rows.iter().map(|row| row.number);
-        let mut out: Vec<u32> = numbers
-            .zip(&rows)
-            .filter(|(number, out)| **out && *number != NO_NUMBER)
-            .map(|(number, _)| number)
-            .collect();
+        let out = self.recording.rows.iter().zip(&rows).filter(|(_, out)| **out).map(|(row, _)| row);
+        if let Some(row) = out.clone().find(|row| row.number == NO_NUMBER) {
+            let message = "the record has no _index, so nothing can say that it is left out";
+            return Err(Refusal::Failed(Error::data_at(&self.recording.path, u64::from(row.line), message)));
+        }
+        let mut out: Vec<u32> = out.map(|row| row.number).collect();
         out.sort_unstable();
         self.exclusions.save(&out, &self.numbers).map_err(Refusal::Failed)?;
         *left_out = LeftOutRows { revision: left_out.revision + 1, rows };
@@ -270,6 +271,12 @@ impl LeftOutRows {
         }
         LeftOut { revision: self.revision, stretches }
     }
+}
+
+/// A number that no earlier program at this port began with, so that a page of another recording does not change this one. It fits a
+/// number of JavaScript.
+fn first_revision() -> u64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_millis() as u64)
 }
 
 fn json(value: &impl Serialize) -> String {

@@ -120,7 +120,7 @@ fn picture(query: &str, desk: &Desk) -> Vec<u8> {
         [0x89, b'P', b'N', b'G', ..] => "image/png",
         _ => return http::plain("404 Not Found", "there is no such picture, or it cannot be read").into_bytes(),
     };
-    with_headers(content_type, "private, max-age=60", &bytes)
+    with_headers(content_type, "no-store", &bytes)
 }
 
 fn leave_out(head: &Head, body: &[u8], desk: &Desk) -> Vec<u8> {

@@ -33,10 +33,15 @@ pub struct DrivenSessions {
 }
 
 /// Speed at each row of `recording`, m/s: a row without one keeps the last one of its session, the first rows of a session take its
-/// first one. `None` if no row says a speed other than 0.
+/// first one; NaN where a session has none. `None` if no row says a speed other than 0.
 pub(super) fn recorded_speeds_mps(recording: &Recording) -> Option<Vec<f64>> {
     let driven = DrivenSessions::of(recording, recording.geometry.clone());
-    let speeds = driven.sessions.into_iter().flat_map(|session| session.speed_mps);
+    let says_none =
+        |session: &DrivenSession| recording.rows[session.rows.clone()].iter().all(|row| !row.speed_mph.is_finite());
+    let speeds = driven.sessions.into_iter().flat_map(|session| match says_none(&session) {
+        true => vec![f64::NAN; session.rows.len()],
+        false => session.speed_mps,
+    });
     driven.assumed_speed_mps.is_none().then(|| speeds.collect())
 }
 

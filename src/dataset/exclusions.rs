@@ -73,8 +73,9 @@ impl Exclusions {
         path
     }
 
-    /// Leaves out the rows of these numbers, and no others: lines of a log, numbers of a tub's records. The numbers are sorted; of
-    /// two with none of `known` between them a log's file makes one range. Everything else in the file stays as it is.
+    /// Of the rows `known`, leaves out those of these `numbers`, and no others: lines of a log, numbers of a tub's records. Both are
+    /// sorted; of two numbers with none of `known` between them a log's file makes one range. Everything else in the file stays as
+    /// it is, also what it says of rows that are not known, as those that another driver drove.
     ///
     /// # Errors
     ///
@@ -84,7 +85,8 @@ impl Exclusions {
         match &self.place {
             Place::Description(path) => {
                 let text = read_or_empty(path)?;
-                let Some(changed) = with_ranges(&text, &ranges(numbers, known)).map_err(|e| Error::data(path, e))?
+                let Some(changed) =
+                    with_ranges(&text, ranges(numbers, known), known).map_err(|e| Error::data(path, e))?
                 else {
                     return Ok(());
                 };
@@ -95,20 +97,40 @@ impl Exclusions {
             }
             Place::Manifest(path) => {
                 let text = fs::read_to_string(path).map_err(Error::io(path))?;
-                let changed = with_deleted(&text, numbers).map_err(|e| Error::data(path, e))?;
-                let mut backup = path.clone().into_os_string();
-                backup.push(BACKUP);
-                if !Path::new(&backup).exists() {
-                    atomic_file::write(Path::new(&backup), text.as_bytes())?;
-                }
+                let changed = with_deleted(&text, numbers, known).map_err(|e| Error::data(path, e))?;
+                back_up(path, &text)?;
                 atomic_file::write(path, changed.as_bytes())
             }
             Place::List(path) => {
-                let text = serde_json::to_string(numbers).expect("numbers can be written as JSON");
+                let text = read_or_empty(path)?;
+                let old = if text.trim().is_empty() {
+                    Value::Null
+                } else {
+                    back_up(path, &text)?;
+                    serde_json::from_str(&text).map_err(|e| Error::data(path, e.to_string()))?
+                };
+                let text = Value::from(with_unknown(numbers, known, &old)).to_string();
                 atomic_file::write(path, text.as_bytes())
             }
         }
     }
+}
+
+/// Keeps `text`, what the file `path` says before it is changed for the first time.
+fn back_up(path: &Path, text: &str) -> Result<()> {
+    let mut backup = path.to_path_buf().into_os_string();
+    backup.push(BACKUP);
+    if Path::new(&backup).exists() { Ok(()) } else { atomic_file::write(Path::new(&backup), text.as_bytes()) }
+}
+
+/// `numbers`, and those of the list `old` that are not `known`.
+fn with_unknown(numbers: &[u32], known: &[u32], old: &Value) -> Vec<u64> {
+    let old = old.as_array().into_iter().flatten().filter_map(Value::as_u64);
+    let unknown = old.filter(|number| u32::try_from(*number).is_ok_and(|number| known.binary_search(&number).is_err()));
+    let mut all: Vec<u64> = numbers.iter().copied().map(u64::from).chain(unknown).collect();
+    all.sort_unstable();
+    all.dedup();
+    all
 }
 
 fn read_or_empty(path: &Path) -> Result<String> {
@@ -134,10 +156,17 @@ fn ranges(numbers: &[u32], known: &[u32]) -> Vec<[u32; 2]> {
     ranges
 }
 
-/// The description `text` with these `exclude`; `None` if there is nothing to say and nothing was said.
-fn with_ranges(text: &str, ranges: &[[u32; 2]]) -> Result<Option<String>, String> {
+/// The description `text` with these `exclude`, and those of its ranges that hold none of the lines `known`; `None` if there is
+/// nothing to say and nothing was said.
+fn with_ranges(text: &str, mut ranges: Vec<[u32; 2]>, known: &[u32]) -> Result<Option<String>, String> {
     let mut document: DocumentMut =
         text.parse().map_err(|e: toml_edit::TomlError| e.to_string().trim_end().to_string())?;
+    let old = toml::from_str::<Description>(text).map(|said| said.exclude).unwrap_or_default();
+    let holds_known = |[first, last]: &[u32; 2]| {
+        known[known.partition_point(|line| line < first)..].first().is_some_and(|line| line <= last)
+    };
+    ranges.extend(old.into_iter().filter(|range| !holds_known(range)));
+    ranges.sort_unstable();
     if ranges.is_empty() {
         return Ok(document.remove("exclude").map(|_| document.to_string()));
     }
@@ -157,8 +186,8 @@ fn with_ranges(text: &str, ranges: &[[u32; 2]]) -> Result<Option<String>, String
     Ok(Some(document.to_string()))
 }
 
-/// The manifest `text` with these `deleted_indexes`.
-fn with_deleted(text: &str, numbers: &[u32]) -> Result<String, String> {
+/// The manifest `text` with these `deleted_indexes`, and those of its own that are not `known`.
+fn with_deleted(text: &str, numbers: &[u32], known: &[u32]) -> Result<String, String> {
     let mut changed = String::with_capacity(text.len());
     let mut found = false;
     for line in text.split_inclusive('\n') {
@@ -168,7 +197,7 @@ fn with_deleted(text: &str, numbers: &[u32]) -> Result<String, String> {
             continue;
         };
         found = true;
-        value["deleted_indexes"] = numbers.into();
+        value["deleted_indexes"] = with_unknown(numbers, known, &value["deleted_indexes"]).into();
         changed += &value.to_string();
         changed += &line[line.trim_end().len()..];
     }
@@ -192,24 +221,28 @@ mod tests {
 
     #[test]
     fn comments_and_other_entries_stay() {
+        let lines: Vec<u32> = (1..=20).collect();
         let text = "# my drive\nhz = 30.0 # slow\n\n[camera]\npreset = \"udacity\"\n";
-        let changed = with_ranges(text, &[[4, 9], [12, 12]]).unwrap().unwrap();
+        let changed = with_ranges(text, vec![[4, 9], [12, 12]], &lines).unwrap().unwrap();
         assert_eq!(
             changed,
             "# my drive\nhz = 30.0 # slow\nexclude = [[4, 9], [12, 12]]\n\n[camera]\npreset = \"udacity\"\n"
         );
-        let again = with_ranges(&changed.replace("12]]", "12]] # dusk"), &[[5, 5]]).unwrap().unwrap();
+        let again = with_ranges(&changed.replace("12]]", "12]] # dusk"), vec![[5, 5]], &lines).unwrap().unwrap();
         assert!(again.contains("exclude = [[5, 5]] # dusk\n"), "{again}");
-        assert_eq!(with_ranges(&changed, &[]).unwrap().unwrap(), text);
-        assert_eq!(with_ranges(text, &[]).unwrap(), None);
-        assert!(with_ranges("hz = ", &[[1, 1]]).is_err());
+        assert_eq!(with_ranges(&changed, vec![], &lines).unwrap().unwrap(), text);
+        assert_eq!(with_ranges(text, vec![], &lines).unwrap(), None);
+        assert!(with_ranges("hz = ", vec![[1, 1]], &lines).is_err());
+        // Lines 30 to 40 hold no row that can be used today.
+        let with_unknown = with_ranges("exclude = [[2, 3], [30, 40]]\n", vec![[5, 5]], &lines).unwrap().unwrap();
+        assert_eq!(with_unknown, "exclude = [[5, 5], [30, 40]]\n");
     }
 
     #[test]
     fn only_the_deleted_indexes_of_a_manifest_change() {
         let text = "[\"cam/image_array\"]\n{\"created_at\": 1602421393.7723908}\n{\"paths\": [\"catalog_0.catalog\"], \
             \"current_index\": 9, \"deleted_indexes\": [7]}\n";
-        let changed = with_deleted(text, &[1, 2]).unwrap();
+        let changed = with_deleted(text, &[1, 2], &[0, 1, 2, 7]).unwrap();
         let [before, after] = [text, &changed].map(|text| text.lines().map(str::to_owned).collect::<Vec<_>>());
         assert_eq!((&before[..2], before.len()), (&after[..2], after.len()));
         let value: Value = serde_json::from_str(&after[2]).unwrap();
@@ -217,7 +250,9 @@ mod tests {
             value,
             serde_json::json!({"paths": ["catalog_0.catalog"], "current_index": 9, "deleted_indexes": [1, 2]})
         );
-        assert!(with_deleted("{}\n", &[1]).is_err());
+        // Record 7 is not among those that were shown: another driver's, as it may be.
+        assert!(with_deleted(text, &[1, 2], &[0, 1, 2]).unwrap().contains("\"deleted_indexes\":[1,2,7]"));
+        assert!(with_deleted("{}\n", &[1], &[]).is_err());
     }
 
     #[test]

@@ -105,6 +105,8 @@ pub(crate) struct Rows<'a> {
     left_out: LeftOut,
     /// Rows that a person has left out.
     excluded: usize,
+    /// Whether a row was driven by no person who took over, left out or not.
+    driven_on: bool,
     /// Whether the last row was one of them.
     cut: bool,
     /// Stretches that a person has left out so far.
@@ -147,6 +149,7 @@ impl<'a> Rows<'a> {
             said,
             left_out,
             excluded: 0,
+            driven_on: false,
             cut: false,
             cuts: 0,
             locator: Locator::new(store, top, base)?,
@@ -205,6 +208,7 @@ impl<'a> Rows<'a> {
     pub fn push(&mut self, mut entry: Entry) -> Result<()> {
         let named = |range: &[u32; 2]| (range[0]..=range[1]).contains(&entry.number);
         entry.excluded |= self.said.exclude.iter().any(named);
+        self.driven_on |= !entry.taken_over;
         if entry.excluded && !self.keeps_excluded() {
             self.excluded += 1;
             return Ok(());
@@ -322,6 +326,7 @@ impl<'a> Rows<'a> {
             hz: self.said.hz,
             camera: self.said.camera.clone(),
             assumed_hz: self.assumed_hz,
+            all_taken_over: !self.driven_on,
             rows: self.rows,
             files: self.files,
             unusable: self.unusable,
@@ -339,6 +344,8 @@ pub(crate) struct Collected {
     hz: Option<f64>,
     camera: Option<GeometryEntry>,
     assumed_hz: f64,
+    /// Whether a person took over in all rows, also in those that were left out.
+    all_taken_over: bool,
     rows: Vec<Row>,
     files: Files,
     unusable: Unusable,
@@ -359,7 +366,7 @@ impl Collected {
         format: &'static Format,
     ) -> Result<Recording> {
         // Who drove all of it took the wheel from nobody.
-        if self.rows.iter().all(|row| row.taken_over) {
+        if self.all_taken_over {
             self.rows.iter_mut().for_each(|row| row.taken_over = false);
         }
         let camera = self.camera.unwrap_or_default();

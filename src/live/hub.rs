@@ -131,7 +131,7 @@ impl Hub {
     pub fn request(&self, id: u64, request: Request) {
         let mut playback = lock(&self.playback);
         match request {
-            Request::Pause => playback.paused = !playback.paused,
+            Request::Pause => (playback.paused, playback.hurried_trail) = (!playback.paused, None),
             Request::Rate { rate } => playback.set_rate(rate),
             Request::NextRun => {
                 playback.hurried_trail = Some(lock(&self.newest).trail_id);
@@ -143,6 +143,12 @@ impl Hub {
                 }
             }
         }
+    }
+
+    /// Time goes on, and no run is hurried.
+    pub fn play(&self) {
+        let mut playback = lock(&self.playback);
+        (playback.paused, playback.hurried_trail) = (false, None);
     }
 
     /// How fast a watched drive is to be shown.
@@ -221,6 +227,10 @@ mod tests {
         assert_eq!(hub.playback(), Playback { paused: true, rate: 16.0, hurried_trail: None });
         hub.request(1, Request::NextRun);
         assert_eq!(hub.playback(), Playback { paused: false, rate: 16.0, hurried_trail: Some(3) });
+        hub.request(2, Request::Pause);
+        assert_eq!(hub.playback(), Playback { paused: true, rate: 16.0, hurried_trail: None });
+        hub.play();
+        assert!(!hub.playback().paused);
     }
 
     #[test]

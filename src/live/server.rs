@@ -98,6 +98,11 @@ impl Live {
         self.hub.playback()
     }
 
+    /// Time goes on, and no run is hurried.
+    pub(super) fn play(&self) {
+        self.hub.play();
+    }
+
     /// Calls `look` with the wheel, if a person may drive.
     pub(crate) fn with_wheel<T>(&self, look: impl FnOnce(&mut Wheel) -> T) -> Option<T> {
         self.hub.wheel().map(|mut wheel| look(&mut wheel))

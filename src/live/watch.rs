@@ -16,6 +16,8 @@ use crate::simulator::{DriveEvent, DriveFrame, HEIGHT, TrialOptions, WIDTH};
 
 /// Longest time until a wait notices that it has to end.
 const TICK: Duration = Duration::from_millis(50);
+/// A drive that was paused goes on when nobody has looked for so long.
+const LONGEST_PAUSE_ALONE: Duration = Duration::from_secs(10);
 /// Largest number of results on the page.
 const MAX_RESULTS: usize = 12;
 
@@ -85,9 +87,18 @@ impl Shown {
         (trail_id, time_s): (u64, f64),
         stop: &StopSignal,
     ) -> Result<()> {
+        let mut alone_since = None;
         loop {
             stop.check()?;
             let playback = live.playback();
+            if playback.paused && live.viewers() == 0 {
+                let since = *alone_since.get_or_insert_with(Instant::now);
+                if since.elapsed() > LONGEST_PAUSE_ALONE {
+                    live.play();
+                }
+            } else {
+                alone_since = None;
+            }
             if self.state.playback.is_some_and(|shown| shown != playback) {
                 self.state.playback = Some(playback);
                 live.publish(&self.state, &self.camera_jpeg, &self.saliency_jpeg);
@@ -104,6 +115,8 @@ impl Shown {
 impl<'a> Watch<'a> {
     /// Shows `runs` seeds of `driver` on `live` until `stop` is requested. `pilot` is the model that drives, if any.
     pub fn new(live: &'a Live, driver: &'a str, pilot: Option<&Pilot>, runs: usize, stop: &'a StopSignal) -> Watch<'a> {
+        // Trails are counted anew.
+        live.play();
         // A network without a convolution has no saliency.
         let saliency = pilot.and_then(|pilot| Some((pilot.clone(), Saliency::new(pilot.network()).ok()?)));
         Watch {

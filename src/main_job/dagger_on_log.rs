@@ -353,10 +353,13 @@ fn write(met: &[&Met], camera: &CarGeometry, time_ms: &mut u64, folder: &Path) -
     let images = folder.join("IMG");
     std::fs::create_dir_all(&images).map_err(Error::io(&images))?;
     let mut log = Vec::from(HEADER);
-    let step_ms = (1000.0 / KEPT_HZ) as u64;
     for (number, view) in met.iter().enumerate() {
-        let new_piece = number > 0 && met[number - 1].place.0 != view.place.0;
-        *time_ms += if new_piece { 60_000 } else { step_ms };
+        let before = number.checked_sub(1).map(|before| met[before].place).filter(|place| place.0 == view.place.0);
+        // Between two views of a piece lie as many frames as were driven, kept or not.
+        *time_ms += match before {
+            Some(place) => ((view.place.1 - place.1) as f64 * 1000.0 / DRIVE_HZ) as u64,
+            None => 60_000,
+        };
         let name = picture_name("center", *time_ms);
         let file = images.join(&name);
         std::fs::write(&file, &view.jpeg).map_err(Error::io(&file))?;

@@ -6,7 +6,7 @@ use super::co_driver::{HandWheel, Hands};
 use crate::simulator::DriverAnswer;
 use crate::simulator::car::dynamics::STEP_S;
 use crate::simulator::car::keys;
-use crate::simulator::car::speed::{Pace, SpeedController, slower_in_bends_mph};
+use crate::simulator::car::speed::{MIN_BRAKE_MPH, Pace, SpeedController, slower_in_bends_mph};
 use crate::udacity::Command;
 
 /// How the car is driven.
@@ -32,8 +32,6 @@ impl Default for HelmOptions {
 pub const HOLD_TIME: Duration = Duration::from_millis(500);
 /// Longest time of braking while the speed is unknown. A car that stands would drive backwards after that.
 const MAX_BLIND_BRAKE_S: f64 = 3.0;
-/// Speed below which the helm does not brake, mph: the simulator drives backwards when it brakes below 5 mph.
-const MIN_BRAKE_MPH: f64 = 5.0;
 /// Largest number of the wheel's steps between two frames: after a longer gap, a key does not throw the wheel round.
 const MAX_KEY_STEPS: f64 = 10.0;
 /// Throttle of the brake.
@@ -90,23 +88,34 @@ impl Helm {
             let share = 1.0 - (-(time_s - last_s).max(0.0) / self.options.smooth_s).exp();
             steering = self.last.steering + share as f32 * (steering - self.last.steering);
         }
+        let throttle = self.throttle_of_model(pace, steering, speed_mph, time_s);
+        self.remember(Command { steering, throttle }, time, time_s)
+    }
+
+    /// The throttle where the model drives, or a person steers and leaves the pedals alone.
+    fn throttle_of_model(&mut self, pace: Option<Pace>, steering: f32, speed_mph: f64, time_s: f64) -> f32 {
         let mut target_mph = self.options.speed_mph;
         if self.options.slower_in_bends {
             target_mph = slower_in_bends_mph(target_mph, f64::from(steering));
         }
-        let throttle = match pace.filter(|_| self.options.pace_of_model) {
+        match pace.filter(|_| self.options.pace_of_model) {
             Some(pace) => self.controller.throttle_for(pace, time_s, target_mph, speed_mph),
             None => self.controller.throttle_at(time_s, target_mph, speed_mph),
-        };
-        self.last_s = Some(time_s);
-        self.last_frame = Some((time, Instant::now()));
-        self.last = Command { steering, throttle };
-        self.last
+        }
     }
 
-    /// The command of a person for the frame of `time`; the car drives at `speed_mph`. Keys move the wheel from where it is.
+    /// Keeps the command for the frame of `time`, `time_s` after the drive began.
+    fn remember(&mut self, command: Command, time: FrameTime, time_s: f64) -> Command {
+        self.last_s = Some(time_s);
+        self.last_frame = Some((time, Instant::now()));
+        self.last = command;
+        command
+    }
+
+    /// The command of a person for the frame of `time`, to which the model would `answer`; the car drives at `speed_mph`. Keys move
+    /// the wheel from where it is. Without a pedal the throttle is as if the model drove with this steering.
     /// The accelerator ends at the speed to hold, and the brake where a simulator would drive backwards.
-    pub fn command_by_hand(&mut self, hands: Hands, speed_mph: f64, time: FrameTime) -> Command {
+    pub fn command_by_hand(&mut self, hands: Hands, answer: DriverAnswer, speed_mph: f64, time: FrameTime) -> Command {
         let time_s = self.seconds(time);
         let steering = match hands.wheel {
             HandWheel::At(steering) => steering.clamp(-1.0, 1.0),
@@ -117,16 +126,13 @@ impl Helm {
             }
         };
         let throttle = match hands.throttle {
-            None => self.controller.throttle_at(time_s, self.options.speed_mph, speed_mph),
+            None => self.throttle_of_model(answer.pace, steering, speed_mph, time_s),
             Some(throttle) => {
                 let pace = Pace::Throttle(throttle);
                 self.controller.throttle_for(pace, time_s, self.options.speed_mph, speed_mph)
             }
         };
-        self.last_s = Some(time_s);
-        self.last_frame = Some((time, Instant::now()));
-        self.last = Command { steering, throttle };
-        self.last
+        self.remember(Command { steering, throttle }, time, time_s)
     }
 
     /// The command at `time` without a usable frame: the last steering without throttle for [`HOLD_TIME`], then the brake.
@@ -223,16 +229,25 @@ mod tests {
     fn keys_move_the_wheel_from_where_the_model_left_it_and_the_speed_is_held() {
         let mut helm = Helm::new(HelmOptions::default());
         let left_at = helm.command(0.3, 14.0, FrameTime::Simulated(0.0)).steering;
-        let hands = |wheel, throttle| Hands { wheel, throttle };
+        let answer = DriverAnswer { steering: 0.9, pace: Some(Pace::SpeedMph(12.0)) };
+        let by_hand = |helm: &mut Helm, wheel, throttle, mph, time_s| {
+            helm.command_by_hand(Hands { wheel, throttle }, answer, mph, FrameTime::Simulated(time_s))
+        };
         // Three steps of 20 ms, 0.05 each.
-        let command = helm.command_by_hand(hands(HandWheel::Keys(-1.0), None), 14.0, FrameTime::Simulated(0.06));
+        let command = by_hand(&mut helm, HandWheel::Keys(-1.0), None, 14.0, 0.06);
         assert!((command.steering - (left_at - 0.15)).abs() < 1e-6 && command.throttle > 0.0, "{command:?}");
-        let command = helm.command_by_hand(hands(HandWheel::Keys(1.0), None), 14.0, FrameTime::Simulated(9.0));
+        let command = by_hand(&mut helm, HandWheel::Keys(1.0), None, 14.0, 9.0);
         assert!((command.steering - (left_at - 0.15 + 0.5)).abs() < 1e-6, "ten steps at most: {command:?}");
         for (mph, throttle) in [(10.0, -0.7), (4.0, 0.0)] {
-            let command = helm.command_by_hand(hands(HandWheel::At(2.0), Some(-0.7)), mph, FrameTime::Simulated(9.05));
+            let command = by_hand(&mut helm, HandWheel::At(2.0), Some(-0.7), mph, 9.05);
             assert_eq!(command, Command { steering: 1.0, throttle });
         }
+        // A correction does not change the pace: at 14 mph a model that wants 12 brakes, and bends are still taken slower.
+        let options = HelmOptions { speed_mph: 30.0, pace_of_model: true, ..HelmOptions::default() };
+        assert!(by_hand(&mut Helm::new(options), HandWheel::At(0.5), None, 14.0, 0.0).throttle < 0.0);
+        let options = HelmOptions { slower_in_bends: true, ..HelmOptions::default() };
+        let straight = by_hand(&mut Helm::new(options), HandWheel::At(0.0), None, 14.0, 0.0).throttle;
+        assert!(by_hand(&mut Helm::new(options), HandWheel::At(0.9), None, 14.0, 0.0).throttle < straight - 0.1);
     }
 
     #[test]

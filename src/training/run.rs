@@ -184,12 +184,13 @@ impl TrainingRun {
             }
             let record = self.end_epoch(validation, epoch_started);
             let observed = observer.observe(TrainingEvent::Epoch { record, of: self.recipe.epochs });
-            if whole && std::mem::take(&mut images_unreported) {
-                self.report_images(observer)?;
-            }
+            let reported = match whole && std::mem::take(&mut images_unreported) {
+                true => self.report_images(observer),
+                false => Ok(()),
+            };
             self.state.progress.seconds = seconds_before + self.started.elapsed().as_secs_f64();
             self.save_checkpoint()?;
-            observed?;
+            observed.and(reported)?;
         }
         self.finish()
     }

@@ -247,11 +247,15 @@ impl OutputSpec {
                 Ok(labels)
             }
             OutputKind::Speed => {
-                if labels.iter().any(|label| label.is_nan()) {
+                let missing = labels.iter().filter(|label| label.is_nan()).count();
+                if missing == labels.len() {
                     let message = "the recipe's output `speed` learns from the recorded speed, and no row has one other than 0: \
                                    record it, or take a recipe whose outputs are the steering alone or with `throttle`";
                     let line = recording.rows.first().map_or(1, |row| u64::from(row.line));
                     return Err(Error::data_at(&recording.path, line, message));
+                }
+                if missing > 0 {
+                    notices.push(format!("{}: {missing} rows of sessions without a speed are left out", place()));
                 }
                 let faster = labels.iter().filter(|share| **share > 1.0).count();
                 if faster > 0 {

@@ -26,9 +26,11 @@ const MAX_NOTICES: usize = 20;
 /// The report is drawn again after this many times the time that it took: watching must not slow the training down.
 const REST: u32 = 10;
 /// A page that has asked within this time is open.
-const OPEN_TIME: Duration = Duration::from_secs(2);
+const OPEN_TIME: Duration = Duration::from_secs(5);
+/// Pause between two looks whether a report is drawn.
+const WAIT: Duration = Duration::from_millis(20);
 /// Longest wait for open pages to fetch the last words and the last report.
-const FAREWELL: Duration = Duration::from_secs(4);
+const FAREWELL: Duration = Duration::from_secs(6);
 
 /// What the page shows above the report.
 #[derive(Clone, Debug, Default, Serialize)]
@@ -66,6 +68,8 @@ struct Report {
     html: String,
     ended: Option<Instant>,
     took: Duration,
+    /// Whether a thread draws it now.
+    is_being_drawn: bool,
     /// Whether it lies in the folder.
     finished: bool,
 }
@@ -90,7 +94,9 @@ impl Desk {
     /// The state as JSON.
     fn state(&self) -> String {
         *lock(&self.last_asked) = Some(Instant::now());
-        let report = self.report_to_show();
+        // With the last words comes the last report.
+        let is_over = lock(&self.state).over.is_some();
+        let report = if is_over { lock(&self.report).newest } else { self.report_to_show() };
         let mut state = lock(&self.state);
         state.report = report;
         serde_json::to_string(&*state).expect("numbers, words and lists can be written as JSON")
@@ -98,28 +104,42 @@ impl Desk {
 
     /// Number of the report that a page should show now: the one that was drawn while a newer one would come too soon.
     fn report_to_show(&self) -> u64 {
-        // While it is drawn, nobody waits.
-        let Ok(report) = self.report.try_lock() else { return lock(&self.state).report };
+        let report = lock(&self.report);
         let rests = report.ended.is_some_and(|ended| ended.elapsed() < report.took * REST);
-        if report.drawn != 0 && rests && !report.finished { report.drawn } else { report.newest }
+        if report.drawn != 0 && (rests || report.is_being_drawn) && !report.finished {
+            report.drawn
+        } else {
+            report.newest
+        }
     }
 
-    /// The newest report.
+    /// The newest report. The training never waits while it is drawn.
     fn report(&self) -> Result<String> {
-        let mut report = lock(&self.report);
-        if report.drawn != report.newest
-            && let Some(folder) = report.folder.clone()
-        {
-            let began = Instant::now();
-            report.html = match report.finished {
-                true => {
-                    let path = folder.join("report.html");
-                    std::fs::read_to_string(&path).map_err(Error::io(&path))?
+        let (folder, newest, finished) = loop {
+            let mut report = lock(&self.report);
+            match &report.folder {
+                Some(folder) if report.drawn != report.newest && !report.is_being_drawn => {
+                    let wanted = (folder.clone(), report.newest, report.finished);
+                    report.is_being_drawn = true;
+                    break wanted;
                 }
-                false => self.pool.install(|| run::render_so_far(&folder))?,
-            };
-            (report.drawn, report.took, report.ended) = (report.newest, began.elapsed(), Some(Instant::now()));
-        }
+                // Another page has asked for the same.
+                Some(_) if report.drawn != report.newest && !self.is_over() => {}
+                _ => return Ok(report.html.clone()),
+            }
+            drop(report);
+            std::thread::sleep(WAIT);
+        };
+        let began = Instant::now();
+        let path = folder.join("report.html");
+        let html = match finished {
+            true => std::fs::read_to_string(&path).map_err(Error::io(&path)),
+            false => self.pool.install(|| run::render_so_far(&folder)),
+        };
+        let mut report = lock(&self.report);
+        (report.is_being_drawn, report.took, report.ended) = (false, began.elapsed(), Some(Instant::now()));
+        report.html = html?;
+        report.drawn = newest;
         Ok(report.html.clone())
     }
 

@@ -103,7 +103,9 @@ impl Page {
                 };
                 let header = headers.get(column).filter(|header| !header.is_empty());
                 let header = header.map_or(String::new(), |header| format!(" data-header=\"{}\"", escape(header)));
-                let _ = write!(self.body, "<td{class}{header}>{}</td>", escape(cell));
+                // Long names break where their words end.
+                let cell = escape(cell).replace('/', "/<wbr/>").replace('_', "_<wbr/>");
+                let _ = write!(self.body, "<td{class}{header}>{cell}</td>");
             }
             self.body.push_str("</tr>");
         }

@@ -66,7 +66,7 @@ impl Connection<'_, '_> {
         let hands = self.shared.co_driver.and_then(|co_driver| co_driver.hands(Instant::now()));
         self.tell_who_drives(hands.is_some());
         let command = match hands {
-            Some(hands) => self.helm.command_by_hand(hands, speed_mph, time),
+            Some(hands) => self.helm.command_by_hand(hands, answer, speed_mph, time),
             None => self.helm.command_for(answer, speed_mph, time),
         };
         self.steer(command)?;

@@ -19,8 +19,8 @@ const AUTO_TOP_MPH: f64 = 30.0;
 /// Minimum speed in bends, mph.
 const MIN_BEND_MPH: f64 = 9.0;
 
-/// Speed below which a driver's own pace does not brake, mph: Udacity's simulator drives backwards when it brakes below 5 mph.
-const MIN_BRAKE_MPH: f64 = 5.0;
+/// Speed below which neither a driver's own pace nor a driver without pictures brakes, mph: Udacity's simulator drives backwards when it brakes below 5 mph.
+pub const MIN_BRAKE_MPH: f64 = 5.0;
 /// Throttle that a driver may give for each mph below the limit of its speed.
 const LIMIT_PER_MPH: f64 = 0.5;
 

@@ -55,13 +55,13 @@ where
             if stopped.load(Ordering::Relaxed) {
                 return Err(Error::Interrupted);
             }
-            let measured = measure(track, &new_driver, options, k, None)?;
-            match tally.add(1) {
-                Ok(()) => {}
-                Err(Error::Interrupted) => stopped.store(true, Ordering::Relaxed),
-                Err(error) => return Err(error),
+            // Whatever ends one seed ends the drive.
+            let stop = |_: &Error| stopped.store(true, Ordering::Relaxed);
+            let measured = measure(track, &new_driver, options, k, None).inspect_err(stop)?;
+            match tally.add(1).inspect_err(stop) {
+                Ok(()) | Err(Error::Interrupted) => Ok(measured),
+                Err(error) => Err(error),
             }
-            Ok(measured)
         })
         .collect();
     let result = put_together(track, options, measured, rayon::current_num_threads())?;
