@@ -68,7 +68,8 @@ def test_ctrl_c_ends_a_long_drive(model):
     began = time.monotonic()
     with pytest.raises(KeyboardInterrupt):
         steersman.drive(model, "lake", laps=2, runs=200, progress=False)
-    assert time.monotonic() - began < 10
+    # All of it would take an hour.
+    assert time.monotonic() - began < 300
 
 
 def test_what_cannot_be_driven_is_an_error(model):

@@ -42,7 +42,7 @@ pub struct OnnxOptions {
 ///
 /// # Errors
 ///
-/// [`Error::Network`] names a layer whose weights do not fit into an ONNX file, or are not finite after folding.
+/// [`Error::Network`](crate::Error::Network) names a layer whose weights do not fit into an ONNX file, or are not finite after folding.
 pub fn onnx(model: &Model, options: OnnxOptions) -> Result<Vec<u8>> {
     let recipe = &model.recipe;
     let mut steps = chain(&recipe.network(Isa::PORTABLE)?, &model.parameters);

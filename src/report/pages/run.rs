@@ -57,7 +57,7 @@ pub fn write(path: &Path) -> Result<PathBuf> {
 ///
 /// # Errors
 ///
-/// As [`write`].
+/// As [`write`](fn@write).
 pub fn render_so_far(path: &Path) -> Result<String> {
     page(&RunFolder::open(path)?, path, true)
 }
