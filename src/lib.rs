@@ -14,6 +14,7 @@
 //! | [`geometry`] | camera and car of a recording, the driven path, views from beside it |
 //! | [`report`], [`live`], [`coach`] | pages, pictures and films; a drive in the browser; cleaning a recording there |
 //! | [`serve`], [`udacity`], [`simulator_client`] | drives Udacity's simulator; its messages; our simulator in its place |
+//! | [`donkeysim`] | our simulator in the place of donkeycar's |
 //! | [`exchange`] | models of other programs in, ours out for them |
 //! | [`main_job`], [`cli`], `python` | what `train` does without a recording; the command line; the Python package |
 //!
@@ -173,6 +174,8 @@ pub mod cli;
 pub mod coach;
 #[cfg(feature = "training")]
 pub mod dataset;
+#[cfg(feature = "serve")]
+pub mod donkeysim;
 pub mod engine;
 pub mod error;
 #[cfg(feature = "training")]

@@ -5,7 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 /// The top-level rooms. A room may use those above it.
-const ROOMS: [&str; 32] = [
+const ROOMS: [&str; 33] = [
     "error",
     "suggestion",
     "text",
@@ -30,6 +30,7 @@ const ROOMS: [&str; 32] = [
     "report",
     "exchange",
     "simulator_client",
+    "donkeysim",
     "serve",
     "live",
     "coach",

@@ -17,6 +17,7 @@ macro_rules! eprintln {
 
 mod bench;
 mod compare;
+mod donkeysim;
 mod drive;
 mod drive_sweep;
 mod evaluate;

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use serde::Serialize;
 
+use super::donkeysim::{self, DonkeySimArgs, Role};
 use super::share_bar::ShareBar;
 use super::{or_dash, print_json, stop_on_ctrl_c};
 use crate::error::{Error, Result};
@@ -19,9 +20,14 @@ use crate::simulator_client::{ClientEvent, ClientOptions, ClientReport, ServerUr
 use crate::statistics::quantile;
 use crate::udacity::{DecimalMark, NumberStyle};
 
-/// Put the built-in simulator in the place of Udacity's: it connects to a driving server, as `serve` is one
+/// Put the built-in simulator in the place of Udacity's: it connects to a driving server, as `serve` is one; or of DonkeySim
 #[derive(Debug, Args)]
 pub struct SimArgs {
+    /// Be another simulator than Udacity's
+    #[arg(long = "as", value_enum, value_name = "NAME", conflicts_with = "connect")]
+    role: Option<Role>,
+    #[command(flatten)]
+    donkeysim: DonkeySimArgs,
     /// The server; a path may be left out
     #[arg(
         long,
@@ -183,6 +189,9 @@ impl Summary {
 
 pub fn run(args: SimArgs) -> Result<()> {
     let track = Track::load(&args.track)?;
+    if let Some(Role::Donkeysim) = args.role {
+        return donkeysim::run(&args.donkeysim, &track, args.seed);
+    }
     if let Some(out) = args.out.as_deref().filter(|out| out.exists()) {
         let message = format!("{}: exists already and is not overwritten; name a new folder", out.display());
         return Err(Error::Usage(message));

@@ -30,6 +30,13 @@ impl<'a> FrontCamera<'a> {
         }
     }
 
+    /// The frame in front of the car as the camera takes it, without the losses of JPEG.
+    pub fn frame(&mut self, simulation: &Simulation) -> &RgbFrame {
+        let camera = Camera::new(&simulation.body_pose(), Mount::Center);
+        self.renderer.render(self.track.world(), &self.variant, &camera, Mount::Center, &mut self.frame);
+        &self.frame
+    }
+
     /// The frame in front of the car, as JPEG.
     ///
     /// # Errors
