@@ -5,6 +5,7 @@ The program to compare with is named by STEERSMAN_BINARY; tests that need it are
 
 import json
 import os
+import signal
 import subprocess
 import warnings
 from pathlib import Path
@@ -14,6 +15,9 @@ import pytest
 import steersman
 
 ROOT = Path(__file__).resolve().parents[2]
+
+# A shell that starts the tests in the background lets them ignore Ctrl-C, which some of them press.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")
