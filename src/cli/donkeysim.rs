@@ -5,6 +5,7 @@ use std::net::{IpAddr, SocketAddr};
 use clap::{Args, ValueEnum};
 
 use super::stop_on_ctrl_c;
+use super::words::counted;
 use crate::donkeysim::{DEFAULT_PORT, DonkeySimOptions, DonkeySimServer, Reading, Scene};
 use crate::error::Result;
 use crate::simulator::Track;
@@ -59,6 +60,6 @@ pub fn run(args: &DonkeySimArgs, track: &Track, seed: u64) -> Result<()> {
         Ok(())
     };
     let clients = server.run(track, &mut say, &stop)?;
-    eprintln!("the simulator has ended after {clients} clients");
+    eprintln!("the simulator has ended after {}", counted(clients as usize, "client"));
     Ok(())
 }

@@ -9,6 +9,7 @@ use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::throttle::Throttle;
+use super::words::counted;
 use super::{load_pilot, or_dash, print_json, stop_on_ctrl_c};
 use crate::error::{Error, Result};
 use crate::live::{self, CoDriverPage};
@@ -120,7 +121,7 @@ fn farewell(summary: &Summary) -> String {
             recorded.folder.display(),
             recorded.by_user
         ),
-        _ => format!("The server has ended after {} frames.", summary.frames),
+        _ => format!("The server has ended after {}.", counted(summary.frames as usize, "frame")),
     }
 }
 
