@@ -287,7 +287,7 @@ fn rust_source_compiles_without_a_warning_or_std_and_agrees() {
 
 const RUST_OUTPUTS_DRIVER: &str = r#"
 #![deny(warnings)]
-#![allow(dead_code)]
+#![allow(dead_code)] // An exported file offers more than this program calls.
 mod model;
 use std::io::Read;
 static MODEL: std::sync::Mutex<model::Model> = std::sync::Mutex::new(model::Model::new());
