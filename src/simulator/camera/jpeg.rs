@@ -54,6 +54,7 @@ impl RoundTrip {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::simulator::WIDTH;
 
     #[test]
     fn a_round_trip_changes_a_smooth_picture_little_and_keeps_its_colours() {
