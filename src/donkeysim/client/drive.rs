@@ -247,8 +247,8 @@ impl Client<'_> {
                     self.options.time_limit_s
                 ));
             }
-            let laps = (index * self.options.laps + run.laps_completed()) as f64;
-            self.share = laps / (self.options.runs * self.options.laps) as f64;
+            let laps = (index * self.options.laps) as f64 + run.laps_driven();
+            self.share = (laps / (self.options.runs * self.options.laps) as f64).clamp(0.0, 1.0);
             self.tick()?;
             let telemetry = self.newest(run)?;
             let now = Instant::now();

@@ -125,6 +125,12 @@ impl Run {
         self.trial.laps_completed
     }
 
+    /// Laps so far with the part that the nodes tell of the present one.
+    pub fn laps_driven(&self) -> f64 {
+        let by_nodes = self.laps.node.map_or(0.0, |[_, total]| self.laps.passed as f64 / total as f64);
+        by_nodes.max(self.trial.laps_completed as f64)
+    }
+
     /// Whether the run has failed, or is too long to be kept.
     pub fn is_over(&self) -> bool {
         self.trial.failure.is_some() || self.trial.moments.len() >= MAX_MOMENTS
@@ -201,15 +207,16 @@ mod tests {
     #[test]
     fn laps_are_counted_by_line_by_time_and_by_nodes() {
         let mut run = Run::new(8.0, 8.0);
-        for (time_s, laps) in [(0.0, 0), (0.5, 0), (1.0, 0), (5.0, 1), (9.0, 2)] {
-            // Steps of more than a second count as one.
-            for k in 0..10 {
-                run.see(&at(time_s + f64::from(k) * 0.4), 0.0);
+        let mut now_s = 50.0;
+        for (steps, laps) in [(1, 0), (5, 0), (5, 0), (20, 1), (20, 2)] {
+            for _ in 0..steps {
+                now_s += 0.2;
+                run.see(&at(now_s), 0.0);
             }
             run.cross_line(0);
             run.cross_line(0);
             run.cross_line(1);
-            assert_eq!(run.laps_completed(), laps, "{time_s}");
+            assert_eq!(run.laps_completed(), laps, "{now_s}");
         }
         let mut timed = Run::new(8.0, 8.0);
         [0.0, 31.0, 30.0].into_iter().for_each(|s| timed.time_lap(s));
@@ -219,6 +226,7 @@ mod tests {
             nodes.see(&Telemetry { node: Some([node, 100]), ..at(0.0) }, 0.0);
             assert_eq!(nodes.laps_completed(), laps, "{node}");
         }
+        assert!((nodes.laps_driven() - 1.32).abs() < 1e-9, "{}", nodes.laps_driven());
         assert!(nodes.counts_laps() && !Run::new(8.0, 8.0).counts_laps());
         assert_eq!(nodes.finish(1).laps_completed, 1);
     }
