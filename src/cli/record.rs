@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use clap::{Args, ValueEnum};
 
 use super::share_bar::ShareBar;
-use super::{pool, print_json, stop_on_ctrl_c};
+use super::{camera_preset, pool, print_json, stop_on_ctrl_c};
 use crate::error::Result;
 use crate::live::{DEFAULT_PORT, ManualDrive, Shares};
 use crate::simulator::car::expert::Style;
@@ -19,7 +19,7 @@ pub struct RecordArgs {
     #[arg(long)]
     track: String,
     /// Drive yourself, with keyboard, mouse or gamepad, on a page in a browser of this machine; Ctrl-C ends and saves
-    #[arg(long, conflicts_with_all = ["laps", "recovery", "style", "noise", "threads", "slower_in_bends", "label_ahead"])]
+    #[arg(long, conflicts_with_all = ["laps", "recovery", "style", "noise", "threads", "slower_in_bends", "camera", "label_ahead"])]
     manual: bool,
     /// Port of the page, on this machine only; 0 takes any free one
     #[arg(long, default_value_t = DEFAULT_PORT, requires = "manual")]
@@ -58,6 +58,10 @@ pub struct RecordArgs {
     /// How the log is written
     #[arg(long, value_enum, default_value_t = Format::Sample)]
     format: Format,
+    /// Camera and car to record as: steersman, udacity, udacity-straight, or donkeycar, a small car that drives on a model of the track
+    /// [default: steersman]
+    #[arg(long, value_name = "PRESET")]
+    camera: Option<String>,
     /// Folder of the recording; must not exist
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
@@ -88,7 +92,7 @@ enum Format {
 pub fn run(args: RecordArgs) -> Result<()> {
     let track = Track::load(&args.track)?;
     let options = RecordOptions {
-        car: None,
+        car: args.camera.as_deref().map(camera_preset).transpose()?,
         laps: args.laps,
         reverse: args.reverse,
         recovery: args.recovery,

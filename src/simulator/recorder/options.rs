@@ -6,11 +6,11 @@ use std::path::Path;
 use serde::Serialize;
 
 use crate::geometry::CarGeometry;
+use crate::simulator::camera::foreign_car;
 use crate::simulator::car::dynamics::STEPS_PER_S;
 use crate::simulator::car::expert::{Style, pursue};
 use crate::simulator::car::simulation::Simulation;
 use crate::simulator::car::speed::before_bends_mph;
-use crate::simulator::recorder::foreign_car;
 use crate::simulator::track::Track;
 use crate::{Error, Result};
 
