@@ -23,6 +23,26 @@ static uint8_t clamp_level(int32_t x) {
     return (uint8_t)(x < 0 ? 0 : x > 255 ? 255 : x);
 }
 
+/* == blur */
+/* The mean of 3x3 pixels of [h][w][3] with the weights 1, 2, 1 in each direction, rounded half up; mirrored at the border. */
+static void blur(const uint8_t *src, uint8_t *dst, int h, int w) {
+    for (int y = 0; y < h; y++) {
+        int rows[4] = {y > 0 ? y - 1 : h > 1, y, y, y + 1 < h ? y + 1 : y > 0 ? y - 1 : 0};
+        for (int x = 0; x < w; x++) {
+            int columns[4] = {x > 0 ? x - 1 : w > 1, x, x, x + 1 < w ? x + 1 : x > 0 ? x - 1 : 0};
+            for (int c = 0; c < 3; c++) {
+                int sum = 8;
+                for (int i = 0; i < 4; i++) {
+                    for (int j = 0; j < 4; j++) {
+                        sum += src[(rows[i] * w + columns[j]) * 3 + c];
+                    }
+                }
+                *dst++ = (uint8_t)(sum / 16);
+            }
+        }
+    }
+}
+
 /* == resize */
 /* From [from_h][from_w][channels] to [to_h][to_w][channels]. */
 struct resize {

@@ -17,6 +17,24 @@ fn clamp_level(x: i32) -> u8 {
     x.clamp(0, 255) as u8
 }
 
+// == blur
+/// The mean of 3x3 pixels of `[h][w][3]` with the weights 1, 2, 1 in each direction, rounded half up; mirrored at the border.
+fn blur(src: &[u8], dst: &mut [u8], h: usize, w: usize) {
+    let around = |i: usize, n: usize| {
+        [if i > 0 { i - 1 } else { (n > 1) as usize }, i, i, if i + 1 < n { i + 1 } else { i.saturating_sub(1) }]
+    };
+    for (i, out) in dst[..h * w * 3].iter_mut().enumerate() {
+        let (y, x, c) = (i / 3 / w, i / 3 % w, i % 3);
+        let mut sum = 8;
+        for y in around(y, h) {
+            for x in around(x, w) {
+                sum += u16::from(src[(y * w + x) * 3 + c]);
+            }
+        }
+        *out = (sum / 16) as u8;
+    }
+}
+
 // == resize
 /// From `[from_h][from_w][channels]` to `[to_h][to_w][channels]`.
 struct Resize {
