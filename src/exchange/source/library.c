@@ -361,6 +361,34 @@ static void zero_pad(const float *x, float *y, struct pad s) {
     }
 }
 
+/* == resample_map */
+struct resample {
+    int c, h, w, out_h, out_w;
+};
+
+/* Weighted sums of rows and columns of each map. A tap is (first position, first weight, end of the weights). */
+static void resample_map(const float *x, float *y, const int32_t *rows, const float *row_weights, const int32_t *columns,
+                         const float *column_weights, struct resample s) {
+    for (int c = 0; c < s.c; c++) {
+        for (int i = 0; i < s.out_h; i++) {
+            const int32_t *down = rows + 3 * i;
+            for (int j = 0; j < s.out_w; j++) {
+                const int32_t *across = columns + 3 * j;
+                float cell = 0.0f;
+                for (int l = across[1]; l < across[2]; l++) {
+                    int column = across[0] + l - across[1];
+                    float sum = 0.0f;
+                    for (int k = down[1]; k < down[2]; k++) {
+                        sum += row_weights[k] * x[(c * s.h + down[0] + k - down[1]) * s.w + column];
+                    }
+                    cell += column_weights[l] * sum;
+                }
+                *y++ = cell;
+            }
+        }
+    }
+}
+
 /* == scale_channels */
 /* Batch normalisation: a factor and an offset for each channel. */
 static void scale_channels(float *x, int n, const float *factor, const float *offset, int positions) {

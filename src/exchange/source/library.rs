@@ -373,6 +373,40 @@ fn zero_pad(x: &[f32], y: &mut [f32], s: Pad) {
     }
 }
 
+// == resample_map
+struct Resample {
+    c: usize,
+    h: usize,
+    w: usize,
+    out_h: usize,
+    out_w: usize,
+}
+
+/// Weighted sums of rows and columns of each map. A tap is (first position, first weight, end of the weights).
+fn resample_map(
+    x: &[f32],
+    y: &mut [f32],
+    rows: &[i32],
+    row_weights: &[f32],
+    columns: &[i32],
+    column_weights: &[f32],
+    s: Resample,
+) {
+    let places = y[..s.c * s.out_h * s.out_w].iter_mut().enumerate();
+    for (place, out) in places {
+        let (c, i, j) = (place / s.out_w / s.out_h, place / s.out_w % s.out_h, place % s.out_w);
+        let [y, x_tap] = [&rows[3 * i..], &columns[3 * j..]].map(|tap| [tap[0] as usize, tap[1] as usize, tap[2] as usize]);
+        *out = 0.0;
+        for (l, across) in column_weights[x_tap[1]..x_tap[2]].iter().enumerate() {
+            let mut sum = 0.0;
+            for (k, down) in row_weights[y[1]..y[2]].iter().enumerate() {
+                sum += down * x[(c * s.h + y[0] + k) * s.w + x_tap[0] + l];
+            }
+            *out += across * sum;
+        }
+    }
+}
+
 // == scale_channels
 /// Batch normalisation: a factor and an offset for each channel.
 fn scale_channels(x: &mut [f32], factor: &[f32], offset: &[f32], positions: usize) {

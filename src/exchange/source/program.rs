@@ -386,6 +386,23 @@ impl<'a> Program<'a> {
                 sizes.extend([("top", *top), ("left", *left), ("out_h", output.h), ("out_w", output.w)]);
                 self.map_call(step, "zero_pad", vec![Arg::Sizes("pad", sizes)]);
             }
+            ExportForm::Resize { rows, columns } => {
+                let mut args = Vec::new();
+                for (axis, taps) in [("row", rows), ("column", columns)] {
+                    let (mut ranges, mut all) = (Vec::new(), Vec::new());
+                    for i in 0..taps.outputs() {
+                        let (first, weights) = taps.of(i);
+                        ranges.extend([first as i32, all.len() as i32, (all.len() + weights.len()) as i32]);
+                        all.extend_from_slice(weights);
+                    }
+                    args.push(self.array(array(&format!("{axis}s")), Values::I32(ranges)));
+                    args.push(self.array(array(&format!("{axis}_weights")), Values::F32(all)));
+                }
+                let mut sizes = map_sizes(*input);
+                sizes.extend([("out_h", output.h), ("out_w", output.w)]);
+                args.push(Arg::Sizes("resample", sizes));
+                self.map_call(step, "resample_map", args);
+            }
             // A map is laid out as the vector is.
             ExportForm::Flatten | ExportForm::Identity => {}
         }
