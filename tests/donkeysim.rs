@@ -12,7 +12,7 @@ use steersman::simulator::Track;
 /// Runs `test` against a server; the notices to its user are the result.
 fn with_server(scene: Scene, reading: Reading, test: impl FnOnce(SocketAddr)) -> Vec<String> {
     let address = SocketAddr::from(([127, 0, 0, 1], 0));
-    let server = DonkeySimServer::bind(DonkeySimOptions { address, scene, reading, seed: 1 }).unwrap();
+    let server = DonkeySimServer::bind(DonkeySimOptions { address, scene, reading, seed: 1, car: None }).unwrap();
     let (address, stop, track) = (server.address().unwrap(), StopSignal::default(), Track::load("lake").unwrap());
     let mut said = Vec::new();
     std::thread::scope(|scope| {

@@ -4,8 +4,8 @@ use std::net::{IpAddr, SocketAddr};
 
 use clap::{Args, ValueEnum};
 
-use super::stop_on_ctrl_c;
 use super::words::counted;
+use super::{camera_preset, stop_on_ctrl_c};
 use crate::donkeysim::{DEFAULT_PORT, DonkeySimOptions, DonkeySimServer, Reading, Scene};
 use crate::error::Result;
 use crate::simulator::Track;
@@ -40,6 +40,9 @@ pub struct DonkeySimArgs {
     /// Read messages as the real simulator does: one for each write of the client, with numbers in strings
     #[arg(long, requires = "role")]
     strict: bool,
+    /// Pictures from the camera of another car: udacity, udacity-straight, steersman or donkeycar
+    #[arg(long, requires = "role", value_name = "PRESET")]
+    camera: Option<String>,
 }
 
 pub fn run(args: &DonkeySimArgs, track: &Track, seed: u64) -> Result<()> {
@@ -51,6 +54,7 @@ pub fn run(args: &DonkeySimArgs, track: &Track, seed: u64) -> Result<()> {
         },
         reading: if args.strict { Reading::Strict } else { Reading::Lenient },
         seed,
+        car: args.camera.as_deref().map(camera_preset).transpose()?,
     };
     let server = DonkeySimServer::bind(options)?;
     eprintln!("{} waits as DonkeySim for clients at {}; Ctrl-C ends it", track.name(), server.address()?);

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use serde::Serialize;
 
+use super::drive_donkeysim::{self, DonkeyDriveArgs};
 use super::drive_sweep;
 use super::recording_args::RecordingArgs;
 use super::replay::{self, ReplayArgs};
@@ -12,11 +13,12 @@ use super::share_bar::ShareBar;
 use super::throttle::Throttle;
 use super::video::tell_video;
 use super::words::counted;
-use super::{load_pilot, pool, print, print_json, stop_on_ctrl_c};
+use super::{camera_preset, load_pilot, pool, print, print_json, stop_on_ctrl_c};
 use crate::dataset::held_out::trained_on_held_out;
 use crate::error::{Error, Result};
 use crate::files::limits::keep_elsewhere;
 use crate::files::new_folder::NewFolder;
+use crate::geometry::CarGeometry;
 use crate::live::{DEFAULT_PORT, Hello, Live, Watch};
 use crate::observer::StopSignal;
 use crate::pilot::Pilot;
@@ -28,7 +30,7 @@ use crate::report::video::painter::Captions;
 use crate::simulator::trial::statistics::PairedTest;
 use crate::simulator::trial::trajectory::write_trajectories;
 use crate::simulator::{
-    DriveOptions, DriveResult, DriveSummary, Driver, Expert, Speed, Track, Zero, compare, drive_as_far,
+    DriveOptions, DriveResult, DriveSummary, Driver, Expert, InCar, Speed, Track, Zero, compare, drive_as_far,
     drive_observed_as_far,
 };
 
@@ -38,28 +40,29 @@ pub struct DriveArgs {
     /// Model file, or `expert`, or `zero` (never steers)
     pub(super) model: String,
     /// lake, mountain, coast, forest, random:SEED, or a track file
-    #[arg(long, required_unless_present = "on")]
+    #[arg(long, required_unless_present_any = ["on", "donkeysim"])]
     track: Option<String>,
     /// Drive on the pictures of a recording instead of a track: the nearest one, warped to where the car is
     #[arg(long, value_name = "RECORDING", conflicts_with = "track")]
     on: Option<PathBuf>,
-    /// With --on: camera and car of the recording: udacity, udacity-straight, steersman or donkeycar [default: by its format]
-    #[arg(long, value_name = "PRESET", requires = "on")]
+    /// Camera and car of the recording, or on a track those with which the model drives: udacity, udacity-straight, steersman or
+    /// donkeycar [default: by the recording's format; on a track steersman]
+    #[arg(long, value_name = "PRESET")]
     camera: Option<String>,
     #[command(flatten)]
     reading: RecordingArgs,
     /// Laps of each run
     #[arg(long, default_value_t = 1)]
-    laps: usize,
+    pub(super) laps: usize,
     /// Speed to hold in mph, or `auto`: 30 mph, less in bends [default: 20]; with --throttle model the highest [default: 30]
     #[arg(long, value_name = "MPH|auto", value_parser = speed)]
-    speed: Option<Speed>,
+    pub(super) speed: Option<Speed>,
     /// Who gives the throttle: a controller that holds --speed, or the model, by its output `throttle` or `speed`
     #[arg(long, value_enum, default_value_t = Throttle::Hold, conflicts_with = "on")]
     pub(super) throttle: Throttle,
-    /// Runs, each with a seed of its own, counted from --seed
-    #[arg(long, default_value_t = 10)]
-    pub(super) runs: usize,
+    /// Runs, each with a seed of its own, counted from --seed [default: 10; with --donkeysim 1]
+    #[arg(long)]
+    pub(super) runs: Option<usize>,
     /// First seed; a seed draws start, direction, light, texture and noise
     #[arg(long, default_value_t = 1)]
     seed: u64,
@@ -96,7 +99,12 @@ pub struct DriveArgs {
     /// Print one JSON object as the last line
     #[arg(long)]
     pub(super) json: bool,
+    #[command(flatten)]
+    pub(super) donkeysim: DonkeyDriveArgs,
 }
+
+/// Runs of a drive on a track, unless another number is asked for.
+const RUNS: usize = 10;
 
 /// What `drive --json` prints.
 #[derive(Serialize)]
@@ -112,6 +120,9 @@ struct Report<'a> {
 }
 
 pub fn run(args: DriveArgs) -> Result<()> {
+    if args.donkeysim.is_given() {
+        return drive_donkeysim::run(&args);
+    }
     let (latency_ms, noise) = (first(&args.latency_ms), first(&args.noise));
     let swept = match (args.latency_ms.len() > 1, args.noise.len() > 1) {
         (false, false) => None,
@@ -153,9 +164,14 @@ pub fn run(args: DriveArgs) -> Result<()> {
             });
         }
     };
+    if args.camera.is_some() && (args.watch || args.video.is_some()) {
+        return Err(Error::Usage(
+            "--camera on a track goes neither with --watch nor with --video: leave it out".into(),
+        ));
+    }
     let options = DriveOptions {
         laps: args.laps,
-        runs: args.runs,
+        runs: args.runs.unwrap_or(RUNS),
         seed: args.seed,
         speed: args.throttle.aimed_at(args.speed)?,
         latency_ms,
@@ -254,7 +270,12 @@ impl DriveArgs {
         if let Wheel::Model(pilot) = &wheel {
             self.throttle.check(pilot, name)?;
         }
-        Ok(wheel)
+        // On a recording the camera is the recording's.
+        let camera = self.camera.as_deref().filter(|_| self.on.is_none());
+        match (wheel, camera.map(camera_preset).transpose()?) {
+            (Wheel::Model(pilot), Some(car)) => Ok(Wheel::InCar(pilot, car)),
+            (wheel, _) => Ok(wheel),
+        }
     }
 }
 
@@ -277,6 +298,8 @@ pub(super) enum Wheel {
     Expert,
     Zero,
     Model(Box<Pilot>),
+    /// Looking through the camera of another car.
+    InCar(Box<Pilot>, CarGeometry),
 }
 
 impl Wheel {
@@ -293,6 +316,7 @@ impl Wheel {
             Wheel::Expert => Box::new(Expert),
             Wheel::Zero => Box::new(Zero),
             Wheel::Model(pilot) => pilot.clone(),
+            Wheel::InCar(pilot, car) => Box::new(InCar { driver: Pilot::clone(pilot), car: car.clone() }),
         }
     }
 
@@ -351,7 +375,7 @@ impl Wheel {
             let mut bar = ShareBar::new(format!("{name} on {}", track.name()), stop);
             drive_as_far(track, new_driver, options, &mut bar)?
         };
-        if let Wheel::Model(pilot) = self {
+        if let Wheel::Model(pilot) | Wheel::InCar(pilot, _) = self {
             result.summary.trained_on_held_out = pilot.trained_on_held_out().to_vec();
         }
         Ok((result, stopped))

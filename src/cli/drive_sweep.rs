@@ -82,7 +82,7 @@ pub fn run(args: &DriveArgs, track: &Track, options: &DriveOptions, swept: Swept
     if args.json {
         print_json(&Report::of(track.name(), &sweeps[0], sweeps.get(1)))?;
     } else {
-        print(&sweeps.iter().map(|sweep| table(track, args.runs, sweep)).collect::<Vec<_>>().join("\n"))?;
+        print(&sweeps.iter().map(|sweep| table(track, options.runs, sweep)).collect::<Vec<_>>().join("\n"))?;
     }
     saved.and(stop_or_ok(ended))
 }

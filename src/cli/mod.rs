@@ -19,6 +19,7 @@ mod bench;
 mod compare;
 mod donkeysim;
 mod drive;
+mod drive_donkeysim;
 mod drive_sweep;
 mod evaluate;
 mod experiment;
@@ -57,10 +58,12 @@ use clap::{Args, CommandFactory, Parser, Subcommand};
 use serde::Serialize;
 
 use crate::error::{Error, Result};
+use crate::geometry::CarGeometry;
 use crate::model_file::{Model, notice_without_digest};
 use crate::observer::StopSignal;
 use crate::pilot::Pilot;
 use crate::recipe::Recipe;
+use crate::simulator::camera_trouble;
 use crate::text::{escaped, escaped_json, escaped_lines};
 use model_arg::model_file;
 
@@ -217,7 +220,7 @@ fn recipe_entry(error: &clap::Error, args: Vec<String>) -> Option<String> {
 /// Which recipe, and what to change in it.
 #[derive(Clone, Debug, Args)]
 struct RecipeArgs {
-    /// A built-in recipe (default, recording, hyper, hyper-prelu, lenet, pilotnet) or a recipe file [default: recording
+    /// A built-in recipe (default, calm, recording, hyper, hyper-prelu, lenet, pilotnet, donkey) or a recipe file [default: recording
     /// with a recording, else default]
     #[arg(long, value_name = "NAME|FILE")]
     recipe: Option<String>,
@@ -270,6 +273,17 @@ fn say_if_without_digest(path: &Path) -> Result<()> {
         eprintln!("note: {}", escaped(&notice));
     }
     Ok(())
+}
+
+/// The camera and the car of the preset `name`, which the simulator must be able to have.
+fn camera_preset(name: &str) -> Result<CarGeometry> {
+    let known = || CarGeometry::presets().map(|(name, _)| name).collect::<Vec<_>>().join(", ");
+    let car = CarGeometry::preset(name)
+        .ok_or_else(|| Error::Usage(format!("--camera {name}: there is no such camera; known are {}", known())))?;
+    match camera_trouble(&car) {
+        Some(trouble) => Err(Error::Usage(format!("--camera {name}: {trouble}"))),
+        None => Ok(car),
+    }
 }
 
 /// A rayon pool of `threads` (0: one for each core).

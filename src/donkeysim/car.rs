@@ -4,9 +4,10 @@ use jpeg_encoder::{ColorType, Encoder};
 use serde_json::{Value, json};
 
 use crate::dataset::resize::{Interpolation, Resizer};
+use crate::geometry::CarGeometry;
 use crate::simulator::camera::front_camera::FrontCamera;
 use crate::simulator::car::dynamics::{Controls, STEPS_PER_S};
-use crate::simulator::{HEIGHT, Simulation, Start, Track, WIDTH};
+use crate::simulator::{Simulation, Start, Track};
 use crate::{Error, Result};
 
 /// DonkeySim builds its scenes so many times as large as the world: its newer versions divide positions, speeds and
@@ -41,12 +42,12 @@ pub struct DonkeyCar<'a> {
 }
 
 impl<'a> DonkeyCar<'a> {
-    /// A car that stands at the start. `seed` draws light and textures.
-    pub fn new(track: &'a Track, seed: u64) -> DonkeyCar<'a> {
+    /// A car that stands at the start, with the camera of `car` or the simulator's own. `seed` draws light and textures.
+    pub fn new(track: &'a Track, seed: u64, car: Option<&CarGeometry>) -> DonkeyCar<'a> {
         DonkeyCar {
             track,
             simulation: at_start(track),
-            camera: FrontCamera::new(track, seed),
+            camera: FrontCamera::of_car(track, seed, car),
             controls: Controls::default(),
             size: SIZE,
             frames: 0,
@@ -148,11 +149,12 @@ impl<'a> DonkeyCar<'a> {
     fn picture(&mut self) -> Result<String> {
         let frame = self.camera.frame(&self.simulation);
         let [height, width] = self.size;
-        // The largest part of 320x160 pixels with that shape.
-        let rows = HEIGHT.min(WIDTH * height / width).max(1);
-        let columns = WIDTH.min(HEIGHT * width / height).max(1);
-        let (top, left) = ((HEIGHT - rows) / 2, (WIDTH - columns) / 2);
-        let row = |y: usize| &frame.pixels[(y * WIDTH + left) * 3..(y * WIDTH + left + columns) * 3];
+        // The largest part of what the camera sees with that shape.
+        let [high, wide] = frame.size;
+        let rows = high.min(wide * height / width).max(1);
+        let columns = wide.min(high * width / height).max(1);
+        let (top, left) = ((high - rows) / 2, (wide - columns) / 2);
+        let row = |y: usize| &frame.pixels[(y * wide + left) * 3..(y * wide + left + columns) * 3];
         let part: Vec<u8> = (top..top + rows).flat_map(|y| row(y).iter().copied()).collect();
         let mut pixels = vec![0; height * width * 3];
         Resizer::new([rows, columns], [height, width], 3, Interpolation::Area).apply(&part, &mut pixels);

@@ -1,4 +1,5 @@
-//! What a client of DonkeySim sends: JSON objects, one behind the other, text in, commands out, no sockets.
+//! What a client of DonkeySim sends: JSON objects, one behind the other, text in, commands out, no sockets; and the other way round, for
+//! our own client.
 //!
 //! The client writes bare objects without line ends, so the stream is split where an object ends. All values are strings, as in
 //! `{"msg_type": "control", "steering": "0.25", "throttle": "0.1", "brake": "0.0"}`.
@@ -59,6 +60,13 @@ pub enum Command {
     },
     /// Settings without an effect here, by their name.
     Ignored(String),
+}
+
+/// A message of a client: a bare object whose values are all strings, as the real simulator wants them.
+pub fn text(kind: &str, fields: &[(&str, String)]) -> String {
+    let mut message = Map::from_iter([("msg_type".to_string(), kind.into())]);
+    message.extend(fields.iter().map(|(name, value)| (name.to_string(), value.as_str().into())));
+    Value::Object(message).to_string()
 }
 
 /// Splits what arrives into messages.
@@ -194,6 +202,18 @@ mod tests {
         assert!(
             push(plain, Reading::Strict)[0].as_ref().unwrap_err().contains("`steering` must be a number in a string")
         );
+    }
+
+    #[test]
+    fn what_our_client_writes_is_read_strictly_without_a_loss() {
+        let read = |kind: &str, fields: &[(&str, String)]| {
+            Splitter::default().push(text(kind, fields).as_bytes(), Reading::Strict).unwrap().remove(0)
+        };
+        let control = [("steering", "-0.25000"), ("throttle", "0.5"), ("brake", "0")].map(|(n, v)| (n, v.to_string()));
+        assert_eq!(read("control", &control), Ok(Command::Control { steering: -0.25, throttle: 0.5, brake: 0.0 }));
+        assert_eq!(read("reset_car", &[]), Ok(Command::Reset));
+        let name = "a\"}{\\\n\u{1b}".to_string();
+        assert_eq!(read("load_scene", &[("scene_name", name.clone())]), Ok(Command::LoadScene(name)));
     }
 
     #[test]

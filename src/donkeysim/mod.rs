@@ -5,9 +5,10 @@
 //! and loads one. With [`Scene::Race`] it begins in the scene: `car_loaded`. Every scene is the one track. Each connection has its own car,
 //! and cars do not meet.
 //!
-//! `messages` reads what clients send, `car` drives and writes telemetry, `server` has the sockets.
+//! `messages` reads what clients send, `car` drives and writes telemetry, `server` has the sockets. [`client`] drives the real one.
 
 mod car;
+pub mod client;
 mod messages;
 mod server;
 

@@ -10,6 +10,7 @@ use serde_json::{Value, json};
 
 use super::car::{DonkeyCar, FRAMES_PER_S};
 use super::messages::{Command, Reading, Splitter};
+use crate::geometry::CarGeometry;
 use crate::net::http;
 use crate::observer::{Observer, StopSignal};
 use crate::simulator::Track;
@@ -23,6 +24,8 @@ const LISTEN_PAUSE: Duration = Duration::from_millis(10);
 const SEND_PATIENCE: Duration = Duration::from_secs(3);
 /// Time between two pictures.
 const FRAME_INTERVAL: Duration = Duration::from_millis(1000 / FRAMES_PER_S);
+/// Shortest time between two pictures in which messages are read.
+const MIN_LISTENING: Duration = Duration::from_millis(2);
 /// Most notices about one client: a hostile one must not fill the screen.
 const MAX_NOTICES: usize = 10;
 /// Names of the levels that `gym_donkeycar` may ask for; each is our track.
@@ -61,6 +64,9 @@ pub struct DonkeySimOptions {
     pub reading: Reading,
     /// Draws light and textures.
     pub seed: u64,
+    /// The car whose camera the pictures are from; the simulator's own if there is none. There must be no
+    /// [`trouble`](crate::simulator::camera_trouble) with it.
+    pub car: Option<CarGeometry>,
 }
 
 /// A server that already listens.
@@ -166,7 +172,8 @@ impl Client<'_> {
     /// Why the conversation ended.
     fn converse(&mut self, mut stream: TcpStream, track: &Track, stop: &StopSignal) -> Result<String> {
         let mut splitter = Splitter::default();
-        let mut car = (self.options.scene == Scene::Race).then(|| DonkeyCar::new(track, self.options.seed));
+        let mut car = (self.options.scene == Scene::Race)
+            .then(|| DonkeyCar::new(track, self.options.seed, self.options.car.as_ref()));
         let first = match self.options.scene {
             Scene::Menu => json!({"msg_type": "scene_selection_ready", "loaded": "1"}),
             Scene::Race => json!({"msg_type": "car_loaded"}),
@@ -175,10 +182,15 @@ impl Client<'_> {
             return Ok(reason);
         }
         let mut next_frame = Instant::now() + FRAME_INTERVAL;
-        let mut buffer = [0; 4096];
+        let (mut buffer, mut has_listened) = ([0; 4096], true);
         while !stop.requested() {
-            let left = next_frame.saturating_duration_since(Instant::now());
+            let mut left = next_frame.saturating_duration_since(Instant::now());
+            if !has_listened {
+                // Between two pictures it listens, however long they take.
+                left = left.max(MIN_LISTENING);
+            }
             let mut answers = Vec::new();
+            has_listened = !left.is_zero();
             if left.is_zero() {
                 // A machine that is too slow drives slower; it does not catch up.
                 next_frame = (next_frame + FRAME_INTERVAL).max(Instant::now());
@@ -227,7 +239,7 @@ impl Client<'_> {
             (Command::SceneNames, _) => return Ok(vec![json!({"msg_type": "scene_names", "scene_names": SCENES})]),
             (Command::ProtocolVersion, _) => return Ok(vec![json!({"msg_type": "protocol_version", "version": "2"})]),
             (Command::LoadScene(name), _) if SCENES.contains(&name.as_str()) => {
-                *car = Some(DonkeyCar::new(track, self.options.seed));
+                *car = Some(DonkeyCar::new(track, self.options.seed, self.options.car.as_ref()));
                 return Ok(vec![json!({"msg_type": "car_loaded"})]);
             }
             (Command::LoadScene(name), _) => {

@@ -8,7 +8,7 @@ use crate::dataset::{self, Description, ImageCheck};
 use crate::error::{Error, Result};
 use crate::geometry::CarGeometry;
 use crate::observer::{Observer, StopSignal};
-use crate::simulator::recorder::foreign_car;
+use crate::simulator::camera::foreign_car;
 
 /// The recordings of `takes` under `folder` with camera and car of `recordings`, of which the user says `said`; recorded now if they
 /// are not there.
@@ -72,7 +72,8 @@ mod tests {
     fn the_set_is_recorded_with_the_recordings_camera_and_by_itself_for_the_simulators() {
         let scratch = tempfile::tempdir().unwrap();
         let folder = scratch.path();
-        let takes = [Take { track: "lake".into(), laps: 0.01, reverse: false, recovery: false, seed: 3 }];
+        let takes =
+            [Take { track: "lake".into(), laps: 0.01, reverse: false, recovery: false, seed: 3, ..Take::default() }];
         let set = |recordings: &[PathBuf]| {
             let sets = folder.join("sets");
             simulator_set(&sets, &takes, recordings, &Description::default(), &mut Unobserved, &StopSignal::default())
@@ -98,14 +99,16 @@ mod tests {
     }
 
     #[test]
-    fn different_cameras_and_small_cars_are_refused() {
+    fn different_cameras_and_those_that_cannot_be_simulated_are_refused() {
         let scratch = tempfile::tempdir().unwrap();
         let folder = scratch.path();
-        let [a, b, c] = [("a", "udacity"), ("b", "steersman"), ("c", "donkeycar")]
-            .map(|(name, preset)| recording(folder, name, &format!("preset = \"{preset}\"")));
+        let cameras = ["udacity\"", "steersman\"", "donkeycar\"", "donkeycar\"\nfocal_px = 40.0"];
+        let [a, b, small, fish_eye] =
+            cameras.map(|camera| recording(folder, &camera.replace(['"', '\n'], ""), &format!("preset = \"{camera}")));
         let refused = |recordings: &[PathBuf]| car_of(recordings, &Description::default()).unwrap_err().to_string();
         assert!(refused(&[a.clone(), b]).contains("different cameras"));
-        assert!(refused(&[c]).contains("its lens is another one"));
+        assert!(refused(&[fish_eye]).contains("its lens shows 127 degrees across"));
         assert_eq!(car_of(&[a.clone(), a], &Description::default()).unwrap(), CarGeometry::preset("udacity"));
+        assert_eq!(car_of(&[small], &Description::default()).unwrap(), CarGeometry::preset("donkeycar"));
     }
 }

@@ -18,6 +18,7 @@ pub(crate) mod track;
 pub(crate) mod trial;
 
 pub use camera::contact_sheet::{contact_sheet, side_by_side};
+pub use camera::foreign_car::trouble as camera_trouble;
 pub use camera::jpeg;
 pub use camera::pinhole::{Camera, HEIGHT, Mount, RgbFrame, WIDTH};
 pub use camera::renderer::Renderer;
@@ -32,9 +33,9 @@ pub use scenery::world::World;
 pub use track::Track;
 pub use trial::closed_loop::ClosedLoop;
 pub use trial::drive::{compare, drive, drive_as_far, drive_observed, drive_observed_as_far};
-pub use trial::driver::{DriveState, Driver, DriverAnswer, Expert, Zero};
+pub use trial::driver::{DriveState, Driver, DriverAnswer, Expert, InCar, Zero};
 pub use trial::event::{DriveEvent, DriveFrame};
-pub use trial::outcome::{Trial, TrialOptions};
+pub use trial::outcome::{Failure, Trial, TrialOptions};
 pub use trial::run::{run_trial, run_trial_observed};
 pub use trial::summary::{DriveOptions, DriveResult, DriveSummary};
 

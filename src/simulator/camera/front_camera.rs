@@ -1,9 +1,10 @@
 //! The front camera of a trial, with the light that its seed draws.
 
 use crate::Result;
+use crate::geometry::CarGeometry;
+use crate::simulator::camera::foreign_car::Eye;
 use crate::simulator::camera::jpeg;
-use crate::simulator::camera::pinhole::{Camera, Mount, RgbFrame};
-use crate::simulator::camera::renderer::Renderer;
+use crate::simulator::camera::pinhole::{Mount, RgbFrame};
 use crate::simulator::car::pose::BodyPose;
 use crate::simulator::car::simulation::Simulation;
 use crate::simulator::scenery::light::Variant;
@@ -13,28 +14,32 @@ use crate::simulator::track::Track;
 pub struct FrontCamera<'a> {
     track: &'a Track,
     variant: Variant,
-    renderer: Renderer,
-    frame: RgbFrame,
+    eye: Eye,
+    decoded: RgbFrame,
     bytes: Vec<u8>,
 }
 
 impl<'a> FrontCamera<'a> {
     /// The camera of the trial `seed`.
     pub fn new(track: &'a Track, seed: u64) -> FrontCamera<'a> {
+        FrontCamera::of_car(track, seed, None)
+    }
+
+    /// The same on `car`, for which there must be no [`trouble`](super::foreign_car::trouble).
+    pub fn of_car(track: &'a Track, seed: u64, car: Option<&CarGeometry>) -> FrontCamera<'a> {
+        let eye = Eye::new(car);
         FrontCamera {
             track,
             variant: Variant::new(track.world(), seed),
-            renderer: Renderer::default(),
-            frame: RgbFrame::default(),
+            decoded: RgbFrame::new(eye.size()),
+            eye,
             bytes: Vec::new(),
         }
     }
 
     /// The frame in front of the car as the camera takes it, without the losses of JPEG.
     pub fn frame(&mut self, simulation: &Simulation) -> &RgbFrame {
-        let camera = Camera::new(&simulation.body_pose(), Mount::Center);
-        self.renderer.render(self.track.world(), &self.variant, &camera, Mount::Center, &mut self.frame);
-        &self.frame
+        self.eye.see(self.track.world(), &self.variant, &simulation.body_pose(), Mount::Center)
     }
 
     /// The frame in front of the car, as JPEG.
@@ -46,10 +51,9 @@ impl<'a> FrontCamera<'a> {
     }
 
     fn take(&mut self, body: &BodyPose) -> Result<&[u8]> {
-        let camera = Camera::new(body, Mount::Center);
-        self.renderer.render(self.track.world(), &self.variant, &camera, Mount::Center, &mut self.frame);
+        let frame = self.eye.see(self.track.world(), &self.variant, body, Mount::Center);
         self.bytes.clear();
-        jpeg::encode(&self.frame, &mut self.bytes)?;
+        jpeg::encode(frame, &mut self.bytes)?;
         Ok(&self.bytes)
     }
 
@@ -67,7 +71,7 @@ impl<'a> FrontCamera<'a> {
     /// As [`look`](FrontCamera::look).
     pub fn look_from(&mut self, body: &BodyPose) -> Result<&RgbFrame> {
         self.take(body)?;
-        jpeg::decode(&self.bytes, &mut self.frame)?;
-        Ok(&self.frame)
+        jpeg::decode(&self.bytes, &mut self.decoded)?;
+        Ok(&self.decoded)
     }
 }

@@ -4,7 +4,7 @@ use jpeg_encoder::{ColorType, Encoder, SamplingFactor};
 use zune_jpeg::JpegDecoder;
 use zune_jpeg::zune_core::bytestream::ZCursor;
 
-use crate::simulator::camera::pinhole::{HEIGHT, RgbFrame, WIDTH};
+use crate::simulator::camera::pinhole::RgbFrame;
 use crate::{Error, Result};
 
 /// Quality of the pictures.
@@ -13,22 +13,23 @@ pub const QUALITY: u8 = 75;
 /// Appends the JPEG of `frame` to `out`.
 ///
 /// # Errors
-/// If the frame has not 320x160 pixels.
+/// If the frame has not the pixels of its size, or is higher or wider than 65,535.
 pub fn encode(frame: &RgbFrame, out: &mut Vec<u8>) -> Result<()> {
     let mut encoder = Encoder::new(out, QUALITY);
     encoder.set_sampling_factor(SamplingFactor::F_2_2);
+    let [height, width] = frame.size.map(|side| u16::try_from(side).unwrap_or(0));
     encoder
-        .encode(&frame.pixels, WIDTH as u16, HEIGHT as u16, ColorType::Rgb)
+        .encode(&frame.pixels, width, height, ColorType::Rgb)
         .map_err(|e| Error::Codec(format!("a picture could not be encoded as JPEG: {e}")))
 }
 
-/// Decodes a JPEG of 320x160 pixels into `frame`.
+/// Decodes a JPEG of the size of `frame` into it.
 ///
 /// # Errors
 /// If the bytes are no JPEG of that size.
 pub fn decode(bytes: &[u8], frame: &mut RgbFrame) -> Result<()> {
     let fail = |e: &dyn std::fmt::Display| Error::Codec(format!("a JPEG could not be decoded: {e}"));
-    frame.pixels.resize(WIDTH * HEIGHT * 3, 0);
+    frame.pixels.resize(frame.size[0] * frame.size[1] * 3, 0);
     JpegDecoder::new(ZCursor::new(bytes)).decode_into(&mut frame.pixels).map_err(|e| fail(&e))
 }
 
@@ -53,6 +54,7 @@ impl RoundTrip {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::simulator::WIDTH;
 
     #[test]
     fn a_round_trip_changes_a_smooth_picture_little_and_keeps_its_colours() {

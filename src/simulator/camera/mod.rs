@@ -2,6 +2,7 @@
 
 mod bonnet;
 pub mod contact_sheet;
+pub mod foreign_car;
 pub mod front_camera;
 pub mod jpeg;
 mod objects;

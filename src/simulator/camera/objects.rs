@@ -1,6 +1,6 @@
 //! Draws what stands upright on the ground: walls, and objects beside the road as billboards.
 
-use crate::simulator::camera::pinhole::{FOCAL_PX, HEIGHT, RgbFrame, WIDTH};
+use crate::simulator::camera::pinhole::{HEIGHT, RgbFrame, WIDTH};
 use crate::simulator::camera::view::{FULL, View};
 use crate::simulator::math::{Vec3, hash2, lerp};
 use crate::simulator::road::spec::Wall;
@@ -31,7 +31,7 @@ fn draw_sprite(depths: &mut [f32], view: &View, sprite: &Sprite, frame: &mut Rgb
         return;
     }
     let picture = &view.world.pictures[sprite.picture];
-    let per_m = FOCAL_PX / foot.z;
+    let per_m = view.camera.focal_px / foot.z;
     let (wide, high) = (picture.width_m * sprite.scale * per_m, picture.height_m * sprite.scale * per_m);
     let x = WIDTH as f32 / 2.0 + foot.x * per_m;
     let y = HEIGHT as f32 / 2.0 - foot.y * per_m;
@@ -138,8 +138,13 @@ fn draw_wall(depths: &mut [f32], view: &View, piece: &WallPiece, frame: &mut Rgb
         let t = (MIN_DISTANCE_M - b.z) / (a.z - b.z);
         (b, along_b) = (b + (a - b) * t, length * (1.0 - t));
     }
-    let screen =
-        |p: Vec3| (WIDTH as f32 / 2.0 + p.x / p.z * FOCAL_PX, HEIGHT as f32 / 2.0 - p.y / p.z * FOCAL_PX, 1.0 / p.z);
+    let screen = |p: Vec3| {
+        (
+            WIDTH as f32 / 2.0 + p.x / p.z * view.camera.focal_px,
+            HEIGHT as f32 / 2.0 - p.y / p.z * view.camera.focal_px,
+            1.0 / p.z,
+        )
+    };
     let (mut from, mut to) = ((screen(a), along_a), (screen(b), along_b));
     if from.0.0 > to.0.0 {
         std::mem::swap(&mut from, &mut to);
@@ -155,7 +160,7 @@ fn draw_wall(depths: &mut [f32], view: &View, piece: &WallPiece, frame: &mut Rgb
         let inverse = lerp(i0, i1, t);
         let foot = lerp(y0, y1, t);
         let along_m = piece.along_m + lerp(u0 * i0, u1 * i1, t) / inverse;
-        let per_m = FOCAL_PX * inverse * up;
+        let per_m = view.camera.focal_px * inverse * up;
         let (top, bottom) = (foot - high_m * per_m, foot - low_m * per_m);
         let air = view.air(1.0 / inverse);
         let rows = (top + 0.5).clamp(0.0, HEIGHT as f32) as usize..(bottom + 1.0).clamp(0.0, HEIGHT as f32) as usize;

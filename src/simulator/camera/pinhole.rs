@@ -12,27 +12,36 @@ pub const HEIGHT: usize = 160;
 /// Focal length in pixels, both axes: half the height over the tangent of half the vertical field of view of 60 degrees.
 pub const FOCAL_PX: f32 = 138.564_06;
 
-/// A picture as the camera takes it: 320x160, row by row from the top, three bytes (red, green, blue) a pixel.
+/// A picture as a camera takes it, row by row from the top, three bytes (red, green, blue) a pixel; 320x160 unless the camera is that
+/// of another car.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RgbFrame {
-    /// `HEIGHT * WIDTH * 3` bytes.
+    /// Height and width, pixels.
+    pub size: [usize; 2],
+    /// `height * width * 3` bytes.
     pub pixels: Vec<u8>,
 }
 
 impl Default for RgbFrame {
     fn default() -> Self {
-        RgbFrame { pixels: vec![0; WIDTH * HEIGHT * 3] }
+        RgbFrame::new([HEIGHT, WIDTH])
     }
 }
 
 impl RgbFrame {
-    /// The pixels as an array, `(HEIGHT, WIDTH, 3)`.
+    /// A black picture.
+    pub fn new(size: [usize; 2]) -> RgbFrame {
+        RgbFrame { size, pixels: vec![0; size[0] * size[1] * 3] }
+    }
+
+    /// The pixels as an array, `(height, width, 3)`.
     ///
     /// # Panics
     ///
-    /// Panics if there are not `HEIGHT · WIDTH · 3` bytes of them.
+    /// Panics if there are not `height · width · 3` bytes of them.
     pub fn view(&self) -> ArrayView3<'_, u8> {
-        ArrayView3::from_shape((HEIGHT, WIDTH, 3), &self.pixels).expect("HEIGHT · WIDTH · 3 bytes")
+        let [height, width] = self.size;
+        ArrayView3::from_shape((height, width, 3), &self.pixels).expect("height · width · 3 bytes")
     }
 }
 
@@ -84,6 +93,8 @@ pub struct Camera {
     pub right: Vec3,
     /// Up in the picture.
     pub up: Vec3,
+    /// Focal length in pixels of the 320x160, both axes.
+    pub focal_px: f32,
 }
 
 impl Camera {
@@ -94,7 +105,7 @@ impl Camera {
 
     /// A camera at `place_m` in the body, turned as said: see [`Mount::place_m`] and `PITCH_YAW_ROLL_DEG`.
     ///
-    /// Rotations are applied in Unity's order: roll, then pitch, then yaw.
+    /// Rotations are applied in Unity's order: roll, then pitch, then yaw. The lens is the simulator's own.
     pub fn placed(body: &BodyPose, place_m: [f32; 3], pitch_yaw_roll_deg: [f64; 3]) -> Camera {
         let [(sp, cp), (sy, cy), (sr, cr)] = pitch_yaw_roll_deg.map(|deg| {
             let (sin, cos) = sin_cos(deg.to_radians());
@@ -109,6 +120,7 @@ impl Camera {
             forward: world(yawed(pitched([0.0, 0.0, 1.0]))),
             right: world(yawed(pitched([cr, sr, 0.0]))),
             up: world(yawed(pitched([-sr, cr, 0.0]))),
+            focal_px: FOCAL_PX,
         }
     }
 
@@ -116,8 +128,8 @@ impl Camera {
     /// Pixel centres lie at halves.
     pub fn ray(&self, column: f32, row: f32) -> Vec3 {
         self.forward
-            + self.right * ((column - WIDTH as f32 / 2.0) / FOCAL_PX)
-            + self.up * ((HEIGHT as f32 / 2.0 - row) / FOCAL_PX)
+            + self.right * ((column - WIDTH as f32 / 2.0) / self.focal_px)
+            + self.up * ((HEIGHT as f32 / 2.0 - row) / self.focal_px)
     }
 
     /// Camera coordinates of a point: to the right, up, along the axis, m.
@@ -129,7 +141,10 @@ impl Camera {
     /// Picture point (column, row) of a point in front of the camera, `None` behind it.
     pub fn project(&self, point: Vec3) -> Option<(f32, f32)> {
         let v = self.view(point);
-        (v.z > 0.01).then(|| (WIDTH as f32 / 2.0 + v.x / v.z * FOCAL_PX, HEIGHT as f32 / 2.0 - v.y / v.z * FOCAL_PX))
+        (v.z > 0.01).then(|| {
+            let f = self.focal_px;
+            (WIDTH as f32 / 2.0 + v.x / v.z * f, HEIGHT as f32 / 2.0 - v.y / v.z * f)
+        })
     }
 }
 

@@ -10,7 +10,7 @@
 //!    breaks off between two columns, each pixel is marched on its own, from where the ray of the pixel below ended. Pixels
 //!    without ground show the sky.
 //! 3. *Objects*: walls and billboards are drawn where they are nearer than the ground.
-//! 4. *Bonnet*: the car's own bonnet, which is always in the same place.
+//! 4. *Bonnet*: the car's own bonnet, which is always in the same place; small cars have none.
 
 use crate::simulator::camera::bonnet::Bonnet;
 use crate::simulator::camera::objects;
@@ -42,8 +42,17 @@ impl Default for Renderer {
 }
 
 impl Renderer {
-    /// Renders what `camera` (mounted at `mount`) sees of `world` in the light of `variant`.
-    pub fn render(&mut self, world: &World, variant: &Variant, camera: &Camera, mount: Mount, frame: &mut RgbFrame) {
+    /// Renders what `camera` sees of `world` in the light of `variant`, 320x160. The bonnet is in the picture as from `mount`, if that is
+    /// where the camera is.
+    pub fn render(
+        &mut self,
+        world: &World,
+        variant: &Variant,
+        camera: &Camera,
+        mount: impl Into<Option<Mount>>,
+        frame: &mut RgbFrame,
+    ) {
+        let mount = mount.into();
         let eye = vec3(camera.eye.x - world.terrain.x0, camera.eye.y - world.terrain.y0, camera.eye.z);
         let columns = std::array::from_fn(|k| {
             let column = (k * SPAN) as f32 + 0.5;
@@ -59,11 +68,14 @@ impl Renderer {
         let limit = (world.terrain.nx as f32 - 1.01, world.terrain.ny as f32 - 1.01);
         let rise = world.terrain.highest_m() - eye.z;
         let view = View { world, variant, camera, eye, rise, limit, columns };
+        frame.size = [HEIGHT, WIDTH];
         frame.pixels.resize(WIDTH * HEIGHT * 3, 0);
         self.march(&view, mount);
         self.shade(&view, mount, frame);
         objects::draw(&mut self.depths, &view, frame);
-        self.bonnet.draw(mount, variant, frame);
+        if let Some(mount) = mount {
+            self.bonnet.draw(mount, variant, frame);
+        }
     }
 
     /// Depth along the camera's axis at a pixel of the last picture, m; infinite for the sky.
@@ -73,11 +85,11 @@ impl Renderer {
 
     /// Finds the depth at every row of the marched columns. Rows are the outer loop: the searches of a row do not depend
     /// on each other, so the processor works on several at once.
-    fn march(&mut self, view: &View, mount: Mount) {
+    fn march(&mut self, view: &View, mount: Option<Mount>) {
         let mut lasts = [Some(NEAREST); ANCHORS];
         for (row, anchors) in self.anchors.chunks_exact_mut(ANCHORS).enumerate().rev() {
             // Shading looks at the row below too, so only what is hidden in both rows is left out.
-            let hidden = self.bonnet.hidden_spans(mount, row.saturating_sub(1));
+            let hidden = mount.map_or(0..0, |mount| self.bonnet.hidden_spans(mount, row.saturating_sub(1)));
             for (k, (anchor, last)) in anchors.iter_mut().zip(&mut lasts).enumerate() {
                 // Once a ray meets no land, no ray above it does.
                 *anchor = 0.0;
@@ -95,12 +107,12 @@ impl Renderer {
         }
     }
 
-    fn shade(&mut self, view: &View, mount: Mount, frame: &mut RgbFrame) {
+    fn shade(&mut self, view: &View, mount: Option<Mount>, frame: &mut RgbFrame) {
         let mut spots = [Spot::default(); ANCHORS];
         for row in (0..HEIGHT).rev() {
             let inverses = &self.anchors[row * ANCHORS..(row + 1) * ANCHORS];
             let below = &self.anchors[(row + 1).min(HEIGHT - 1) * ANCHORS..][..ANCHORS];
-            let hidden = self.bonnet.hidden_spans(mount, row);
+            let hidden = mount.map_or(0..0, |mount| self.bonnet.hidden_spans(mount, row));
             for (k, spot) in spots.iter_mut().enumerate() {
                 *spot = view.spot(view.ray(k, row), view.columns[k].level, inverses[k]);
             }

@@ -1,6 +1,6 @@
 //! What one camera sees of the world: where the ground lies behind a pixel, and which colour it has.
 
-use crate::simulator::camera::pinhole::{Camera, FOCAL_PX, HEIGHT, WIDTH};
+use crate::simulator::camera::pinhole::{Camera, HEIGHT, WIDTH};
 use crate::simulator::math::Vec3;
 use crate::simulator::scenery::light::Variant;
 use crate::simulator::scenery::road_texture::{ACROSS_UNITS, ACROSS_UNITS_PER_M, ALONG_UNITS_PER_M, HALF_M, Level};
@@ -100,7 +100,8 @@ impl View<'_> {
     /// Ray through a marched column at a row.
     #[inline(always)]
     pub(super) fn ray(&self, k: usize, row: usize) -> Vec3 {
-        self.columns[k].middle + self.camera.up * ((HEIGHT as f32 / 2.0 - 0.5 - row as f32) * (1.0 / FOCAL_PX))
+        self.columns[k].middle
+            + self.camera.up * ((HEIGHT as f32 / 2.0 - 0.5 - row as f32) * (1.0 / self.camera.focal_px))
     }
 
     /// Follows a ray from `from` (a depth where it is known to be above the land) to where it enters the land.
@@ -203,7 +204,7 @@ impl View<'_> {
     /// The levels of the road's texture and of the map for the resolution at `a`, and the haze there.
     #[inline(always)]
     pub(super) fn levels(&self, a: &Spot, fall: f32) -> Levels<'_> {
-        let wide = a.depth * (1.0 / FOCAL_PX);
+        let wide = a.depth * (1.0 / self.camera.focal_px);
         let long = a.depth * a.depth * fall;
         let larger = |p: f32, q: f32| if p > q { p } else { q };
         let along = larger(a.cos * long, a.sin * wide);
@@ -345,10 +346,13 @@ impl View<'_> {
     ) {
         let level = self.columns[k].level;
         for (i, ((out, depth), below)) in out.iter_mut().zip(depths).zip(below).enumerate() {
-            let ray = self.ray(k, row) + self.camera.right * (i as f32 / FOCAL_PX);
+            let ray = self.ray(k, row) + self.camera.right * (i as f32 / self.camera.focal_px);
             // Above the sky is only sky.
-            let hit =
-                if *below == 0.0 { None } else { self.march(ray, 1.0 / below, ray.z - self.camera.up.z / FOCAL_PX) };
+            let hit = if *below == 0.0 {
+                None
+            } else {
+                self.march(ray, 1.0 / below, ray.z - self.camera.up.z / self.camera.focal_px)
+            };
             let Some(hit) = hit else {
                 *depth = 0.0;
                 let turn = self.columns[k].turn - i as f32 * AROUND as f32 / 900.0;
@@ -358,7 +362,7 @@ impl View<'_> {
             *depth = 1.0 / hit;
             let spot = self.spot(ray, level, *depth);
             // On level ground inverse depth grows with the fall of the ray.
-            let fall = (self.camera.up.z / FOCAL_PX / (ray.z - 1e-3).abs()).min(1.0) * spot.inverse;
+            let fall = (self.camera.up.z / self.camera.focal_px / (ray.z - 1e-3).abs()).min(1.0) * spot.inverse;
             let levels = self.levels(&spot, fall);
             let Spot { x, y, along, across, light, .. } = spot;
             let place = Place { x, y, along, across, light: light as i32 * SPAN as i32 };

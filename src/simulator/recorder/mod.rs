@@ -1,7 +1,6 @@
 //! The expert drives, and its pictures and labels become a recording.
 
 pub mod expert_drive;
-pub mod foreign_car;
 pub mod options;
 pub mod record;
 pub mod sample;

@@ -8,11 +8,11 @@ use rayon::prelude::*;
 use crate::dataset::{DESCRIPTION_FILE, Description};
 use crate::files::new_folder::NewFolder;
 use crate::observer::{Observer, Progress, Tally};
+use crate::simulator::camera::foreign_car;
 use crate::simulator::recorder::expert_drive::drive_expert;
-use crate::simulator::recorder::foreign_car;
 use crate::simulator::recorder::options::{RecordOptions, RecordingInfo};
 use crate::simulator::recorder::sample::Sample;
-use crate::simulator::recorder::writer::{LogLines, Photographer};
+use crate::simulator::recorder::writer::{LogLines, Photographer, has_sides};
 use crate::simulator::scenery::light::Variant;
 use crate::simulator::track::Track;
 use crate::{Error, Result};
@@ -70,17 +70,19 @@ fn fill(
     let world = track.world();
     let variant = Variant::new(world, options.seed);
     let tally = Tally::new(samples.len(), observer);
-    samples.par_iter().try_for_each_init(Photographer::default, |photographer, sample| {
-        photographer.take(world, &variant, options.car.as_ref(), sample, &images)?;
+    let photographer = || Photographer::new(options.car.as_ref());
+    samples.par_iter().try_for_each_init(photographer, |photographer, sample| {
+        photographer.take(world, &variant, sample, &images)?;
         tally.add(1)
     })?;
     let log = folder.unfinished().join("driving_log.csv");
-    let lines = LogLines::new(options.format, out)?;
+    let lines = LogLines::new(options.format, out, has_sides(options.car.as_ref()))?;
     let mut text = lines.header().as_bytes().to_vec();
     let rows = samples.iter().try_for_each(|sample| match &options.car {
         Some(car) => {
             let steering = foreign_car::steering(sample.steering, car);
-            lines.row(&Sample { steering, ..sample.clone() }, &mut text)
+            let speed_mph = sample.speed_mph / foreign_car::scale(car);
+            lines.row(&Sample { steering, speed_mph, ..sample.clone() }, &mut text)
         }
         None => lines.row(sample, &mut text),
     });

@@ -6,10 +6,9 @@ use std::path::{Path, PathBuf};
 
 use crate::dataset::udacity_writer::{HEADER, picture_name, write_row};
 use crate::geometry::CarGeometry;
+use crate::simulator::camera::foreign_car::{Eye, has_side_cameras};
 use crate::simulator::camera::jpeg;
-use crate::simulator::camera::pinhole::{Camera, Mount, RgbFrame};
-use crate::simulator::camera::renderer::Renderer;
-use crate::simulator::recorder::foreign_car;
+use crate::simulator::camera::pinhole::Mount;
 use crate::simulator::recorder::options::LogFormat;
 use crate::simulator::recorder::sample::Sample;
 use crate::simulator::scenery::light::Variant;
@@ -18,36 +17,39 @@ use crate::simulator::track::Track;
 use crate::{Error, Result};
 
 /// Takes the pictures of rows. Keeps its buffers.
-#[derive(Default)]
 pub(crate) struct Photographer {
-    renderer: Renderer,
-    frame: RgbFrame,
+    eye: Eye,
+    has_sides: bool,
     bytes: Vec<u8>,
 }
 
+/// Whether there are side cameras on `car`, or on the simulator's own.
+pub(crate) fn has_sides(car: Option<&CarGeometry>) -> bool {
+    car.is_none_or(has_side_cameras)
+}
+
 impl Photographer {
-    /// Writes the pictures of all cameras, those of `car` if there is one, into the folder `images`.
-    pub fn take(
-        &mut self,
-        world: &World,
-        variant: &Variant,
-        car: Option<&CarGeometry>,
-        sample: &Sample,
-        images: &Path,
-    ) -> Result<()> {
-        for mount in Mount::ALL {
-            let camera = match car {
-                Some(car) => foreign_car::camera(&sample.body, mount, car),
-                None => Camera::new(&sample.body, mount),
-            };
-            self.renderer.render(world, variant, &camera, mount, &mut self.frame);
+    /// With the cameras of `car`, or those of the simulator's own.
+    pub fn new(car: Option<&CarGeometry>) -> Photographer {
+        Photographer { eye: Eye::new(car), has_sides: has_sides(car), bytes: Vec::new() }
+    }
+
+    /// Writes the pictures of all cameras into the folder `images`.
+    pub fn take(&mut self, world: &World, variant: &Variant, sample: &Sample, images: &Path) -> Result<()> {
+        for mount in mounts(self.has_sides) {
+            let frame = self.eye.see(world, variant, &sample.body, *mount);
             self.bytes.clear();
-            jpeg::encode(&self.frame, &mut self.bytes)?;
-            let path = images.join(image_name(mount, sample.time_s));
+            jpeg::encode(frame, &mut self.bytes)?;
+            let path = images.join(image_name(*mount, sample.time_s));
             fs::write(&path, &self.bytes).map_err(Error::io(&path))?;
         }
         Ok(())
     }
+}
+
+/// The cameras in the order of the log's columns; the centre camera is the first.
+fn mounts(has_sides: bool) -> &'static [Mount] {
+    if has_sides { &Mount::ALL } else { &Mount::ALL[..1] }
 }
 
 /// Noon of 1 January 2026, UTC, where simulated time begins in names of pictures: ms since 1970.
@@ -63,16 +65,17 @@ pub(crate) struct LogLines {
     format: LogFormat,
     /// The folder of the pictures as the log names it.
     images: PathBuf,
+    has_sides: bool,
 }
 
 impl LogLines {
-    /// For a recording in the folder `out`.
-    pub fn new(format: LogFormat, out: &Path) -> Result<LogLines> {
+    /// For a recording in the folder `out`, with side cameras or without.
+    pub fn new(format: LogFormat, out: &Path, has_sides: bool) -> Result<LogLines> {
         let images = match format {
             LogFormat::Sample => PathBuf::from("IMG"),
             LogFormat::V2 => std::path::absolute(out).map_err(Error::io(out))?.join("IMG"),
         };
-        Ok(LogLines { format, images })
+        Ok(LogLines { format, images, has_sides })
     }
 
     /// What stands above the rows.
@@ -86,10 +89,13 @@ impl LogLines {
     /// Appends the line of `sample`.
     pub fn row(&self, sample: &Sample, text: &mut Vec<u8>) -> io::Result<()> {
         let separator = if self.format == LogFormat::Sample { ", " } else { "," };
-        let names = Mount::ALL.map(|mount| image_name(mount, sample.time_s));
-        let [center, left, right] = names.map(|name| match self.format {
-            LogFormat::Sample => format!("IMG/{name}"),
-            LogFormat::V2 => self.images.join(name).display().to_string(),
+        let [center, left, right] = Mount::ALL.map(|mount| {
+            let name = image_name(mount, sample.time_s);
+            match self.format {
+                _ if !mounts(self.has_sides).contains(&mount) => String::new(),
+                LogFormat::Sample => format!("IMG/{name}"),
+                LogFormat::V2 => self.images.join(name).display().to_string(),
+            }
         });
         let numbers = [sample.steering, sample.throttle, sample.brake, sample.speed_mph].map(|v| v as f32);
         write_row(text, separator, [&center, &left, &right], numbers)
@@ -122,7 +128,7 @@ impl<'a> RowWriter<'a> {
     pub fn new(track: &'a Track, seed: u64, format: LogFormat, folder: &Path, out: &Path) -> Result<RowWriter<'a>> {
         let images = folder.join("IMG");
         fs::create_dir(&images).map_err(Error::io(&images))?;
-        let lines = LogLines::new(format, out)?;
+        let lines = LogLines::new(format, out, true)?;
         let log = folder.join("driving_log.csv");
         let mut file = File::create_new(&log).map_err(Error::io(&log))?;
         file.write_all(lines.header().as_bytes()).map_err(Error::io(&log))?;
@@ -130,7 +136,7 @@ impl<'a> RowWriter<'a> {
         Ok(RowWriter {
             world,
             variant: Variant::new(world, seed),
-            photographer: Photographer::default(),
+            photographer: Photographer::new(None),
             images,
             len: lines.header().len() as u64,
             lines,
@@ -146,7 +152,7 @@ impl<'a> RowWriter<'a> {
     /// # Errors
     /// If something cannot be written. The rows before stay whole.
     pub fn write(&mut self, sample: &Sample) -> Result<()> {
-        self.photographer.take(self.world, &self.variant, None, sample, &self.images)?;
+        self.photographer.take(self.world, &self.variant, sample, &self.images)?;
         self.text.clear();
         let written = self.lines.row(sample, &mut self.text).and_then(|()| self.file.write_all(&self.text));
         if let Err(source) = written {

@@ -1,5 +1,7 @@
 //! Drivers: anything that answers a frame with steering.
 
+use crate::geometry::CarGeometry;
+use crate::simulator::camera::foreign_car;
 use crate::simulator::camera::pinhole::RgbFrame;
 use crate::simulator::car::expert;
 use crate::simulator::car::simulation::Simulation;
@@ -24,12 +26,18 @@ pub struct DriverAnswer {
 
 /// Something that steers.
 pub trait Driver {
-    /// The steering, [-1, 1], + = right, for what the camera shows: 320x160, after JPEG, as it would be served.
+    /// The steering, [-1, 1], + = right, for what the camera shows after JPEG, as it would be served: 320x160, or
+    /// the picture of [`car`](Driver::car).
     fn steer(&mut self, frame: &RgbFrame, state: &DriveState) -> f32;
 
     /// The same with the throttle or the speed that the driver wants, if it has a mind of its own about that.
     fn drive(&mut self, frame: &RgbFrame, state: &DriveState) -> DriverAnswer {
         DriverAnswer { steering: self.steer(frame, state), pace: None }
+    }
+
+    /// The car through whose camera it looks; the simulator's own if there is none.
+    fn car(&self) -> Option<&CarGeometry> {
+        None
     }
 
     /// Whether the driver wants the trial to end at once, without a result.
@@ -40,6 +48,37 @@ pub trait Driver {
     /// Whether `steer` looks at the picture; if not, none is taken.
     fn needs_frame(&self) -> bool {
         true
+    }
+}
+
+/// A driver that looks through the camera of another car. Steering is that car's.
+pub struct InCar<D> {
+    /// The driver.
+    pub driver: D,
+    /// The car, which the simulator must be able to have.
+    pub car: CarGeometry,
+}
+
+impl<D: Driver> Driver for InCar<D> {
+    fn steer(&mut self, frame: &RgbFrame, state: &DriveState) -> f32 {
+        self.drive(frame, state).steering
+    }
+
+    fn drive(&mut self, frame: &RgbFrame, state: &DriveState) -> DriverAnswer {
+        let answer = self.driver.drive(frame, state);
+        DriverAnswer { steering: foreign_car::steering_of(f64::from(answer.steering), &self.car) as f32, ..answer }
+    }
+
+    fn car(&self) -> Option<&CarGeometry> {
+        Some(&self.car)
+    }
+
+    fn gives_up(&self) -> bool {
+        self.driver.gives_up()
+    }
+
+    fn needs_frame(&self) -> bool {
+        self.driver.needs_frame()
     }
 }
 

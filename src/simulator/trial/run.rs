@@ -44,7 +44,7 @@ fn drive_run(
     mut observer: Option<&mut dyn for<'a> Observer<DriveEvent<'a>>>,
 ) -> Result<Trial> {
     let mut closed_loop = ClosedLoop::new(track, options, seed);
-    let mut eye = (driver.needs_frame() || observer.is_some()).then(|| FrontCamera::new(track, seed));
+    let mut eye = (driver.needs_frame() || observer.is_some()).then(|| FrontCamera::of_car(track, seed, driver.car()));
     let blank = RgbFrame::default();
     let mut controller = SpeedController::default();
     if let Some(observer) = &mut observer {
