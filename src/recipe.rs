@@ -428,7 +428,7 @@ mod tests {
         assert!(error(&["schedule.shape={kind='constant', factor=1}"]).contains("unknown field `factor`"));
         let recipe = Recipe::find("lente", &[]).unwrap_err().to_string();
         assert!(
-            recipe.starts_with("there is no recipe `lente` (did you mean `lenet`?); built in are default,"),
+            recipe.starts_with("there is no recipe `lente` (did you mean `lenet`?); built in are calm, default,"),
             "{recipe}"
         );
         let (_, lenet) = SHIPPED.iter().find(|(name, _)| *name == "lenet").unwrap();

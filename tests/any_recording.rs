@@ -163,8 +163,9 @@ fn labels_are_never_wrong_without_a_word() {
     };
     // One bend is sharp enough to tell degrees from radians.
     let sharp = logged(HEADER, |row, names, s| usual(names, if row == 20 { 12.5 } else { s * 25.0 }));
-    // Three labels of a straight drive are beyond 1.
-    let few = logged(HEADER, |row, names, s| usual(names, if row % 13 == 5 { 17.0 } else { s * 0.1 }));
+    // Three labels of a straight drive are beyond 1, or beyond -1.
+    let few =
+        |beyond: f64| logged(HEADER, move |row, names, s| usual(names, if row % 13 == 5 { beyond } else { s * 0.1 }));
     let tub = |mode: &'static str| {
         let mut tree = Tree::new();
         let mut catalog = String::new();
@@ -214,7 +215,8 @@ fn labels_are_never_wrong_without_a_word() {
         Case { said: said("unit = 'radians'"), ..case("radians, --unit", scaled(25f64.to_radians(), 0.0), &[], ROWS) },
         case("servo", scaled(45.0, 90.0), &["servo", "--unit servo"], 0),
         Case { said: said("unit = 'servo'"), ..case("servo, --unit", scaled(45.0, 90.0), &[], ROWS) },
-        case("a few labels beyond 1", few, &["3 of 40 labels are not in [-1, 1]"], 0),
+        case("a few labels beyond 1", few(17.0), &["3 of 40 labels are not in [-1, 1]"], 0),
+        case("a few labels beyond -1", few(-17.0), &["3 of 40 labels are not in [-1, 1]"], 0),
         case(
             "labels beyond 1 by rounding",
             logged(HEADER, |row, n, s| usual(n, if row == 3 { s } else { s + 0.0 })),

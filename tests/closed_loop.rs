@@ -18,7 +18,8 @@ use steersman::simulator::{DriveOptions, Driver, Track, Zero, drive};
 use steersman::training::{TrainRequest, TrainResult, TrainingEvent, train};
 
 fn learn(folder: &Path, threads: usize) -> (TrainResult, TrackResult) {
-    let take = |reverse, recovery, seed| Take { track: "lake".into(), laps: 0.15, reverse, recovery, seed };
+    let take =
+        |reverse, recovery, seed| Take { track: "lake".into(), laps: 0.15, reverse, recovery, seed, ..Take::default() };
     let takes = [take(false, false, 101), take(true, false, 102), take(false, true, 103), take(true, true, 104)];
     let overrides = ["epochs=8", "samples.flip=both", "samples.side_cameras=0.25"].map(String::from);
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
@@ -71,7 +72,8 @@ fn what_is_learned_from_the_expert_drives_and_does_so_alike_for_any_number_of_th
 }
 
 fn small_scope(folder: &Path) -> Scope {
-    let take = |recovery, seed| Take { track: "lake".into(), laps: 0.05, reverse: false, recovery, seed };
+    let take =
+        |recovery, seed| Take { track: "lake".into(), laps: 0.05, reverse: false, recovery, seed, ..Take::default() };
     Scope {
         recordings: folder.join("recordings"),
         takes: vec![take(false, 1), take(true, 2)],

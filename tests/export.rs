@@ -56,8 +56,8 @@ fn layers() -> String {
     LAYERS.replacen("{ kind = \"batch_norm\" },", &format!("{{ kind = \"batch_norm\" }},{others}"), 1)
 }
 
-/// Every colour space, resized in every way: halved, linear down and up, area down and up, not at all.
-const PREPROCESSINGS: [(&str, &str); 10] = [
+/// Every colour space, resized in every way: halved, linear down and up, area down and up, not at all; blurred before each of these.
+const PREPROCESSINGS: [(&str, &str); 14] = [
     ("bgr", "colour = 'bgr', rows = [1, 39], resize = [21, 33]"),
     ("yuv-old", "colour = 'yuv-old', interpolation = 'linear', rows = [5, 38], resize = [19, 23]"),
     ("hsv", "colour = 'hsv', rows = [2, 38], resize = [18, 25]"),
@@ -68,6 +68,10 @@ const PREPROCESSINGS: [(&str, &str); 10] = [
     ("yuv", "colour = 'yuv', interpolation = 'area', rows = [0, 40], resize = [16, 24]"),
     ("saturation", "colour = 'saturation', rows = [0, 40], resize = [20, 25], colour_first = true"),
     ("copy", "colour = 'lab', rows = [3, 30], resize = [27, 50], colour_first = true"),
+    ("blur", "colour = 'yuv', rows = [5, 38], resize = [19, 23], blur = true"),
+    ("blur-area", "colour = 'bgr', rows = [5, 40], resize = [19, 23], blur = true, interpolation = 'area'"),
+    ("blur-planes", "colour = 'hsv', rows = [0, 40], resize = [20, 25], blur = true, colour_first = true"),
+    ("blur-copy", "colour = 'rgb', rows = [3, 30], resize = [27, 50], blur = true"),
 ];
 
 fn shipped(name: &str) -> Recipe {

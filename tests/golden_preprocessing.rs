@@ -22,6 +22,8 @@ struct Case {
     interpolation: String,
     colour: String,
     colour_first: bool,
+    #[serde(default)]
+    blur: bool,
     shape: [usize; 3],
     means: Vec<f64>,
     samples: Vec<u8>,
@@ -68,8 +70,8 @@ fn every_case_agrees_with_opencv() {
             _ => colours(case.size),
         };
         let table = format!(
-            "source = {:?}\nrows = {:?}\nresize = {:?}\ninterpolation = {:?}\ncolour = {:?}\ncolour_first = {}",
-            case.size, case.rows, case.resize, case.interpolation, case.colour, case.colour_first
+            "source = {:?}\nrows = {:?}\nresize = {:?}\ninterpolation = {:?}\ncolour = {:?}\ncolour_first = {}\nblur = {}",
+            case.size, case.rows, case.resize, case.interpolation, case.colour, case.colour_first, case.blur
         );
         let preprocessing: Preprocessing = toml::from_str(&table).unwrap();
         assert_eq!(preprocessing.output(), case.shape, "{}", case.name);

@@ -104,22 +104,35 @@ fn a_run_stops_in_the_first_epoch_that_completes_the_patience() {
     }
 }
 
-/// A network of zeros predicts 0, so its error is the label itself: times the full lock it is degrees.
+/// Networks that give one answer to every picture: their error is its distance from the label, times the full lock in degrees. Errors to
+/// both sides count alike.
 #[test]
 fn the_mean_absolute_error_is_in_degrees_of_the_front_wheels() {
     let folder = tempfile::tempdir().unwrap();
-    let zeros = "layers=[{kind='flatten'}, {kind='dense', units=1, init={constant=0.0}}]";
-    for full_lock_deg in [25.0, 40.0] {
-        let (out, setting) = (format!("lock-{full_lock_deg}"), format!("full_lock_deg={full_lock_deg:?}"));
-        let (result, history) = train(folder.path(), &out, &["epochs=1", AT_REST, zeros, &setting]);
+    let run = |full_lock_deg: f64, answer: f64| {
+        let out = format!("lock-{full_lock_deg}-{answer}");
+        let weight = answer / (16.0 * 16.0);
+        let ones = "{kind='scale', factor=0.0, offset=1.0}, {kind='flatten'}";
+        let layers = format!("layers=[{ones}, {{kind='dense', units=1, init={{constant={weight:?}}}}}]");
+        let setting = format!("full_lock_deg={full_lock_deg:?}");
+        let (result, history) = train(folder.path(), &out, &["epochs=1", AT_REST, &layers, &setting]);
         let mut split = csv::Reader::from_path(folder.path().join(&out).join("split.csv")).unwrap();
         let rows = split.records().map(|row| row.unwrap()).filter(|row| &row[2] == "validation");
-        let labels: Vec<f64> = rows.map(|row| row[4].parse::<f64>().unwrap().abs()).collect();
-        let expected = full_lock_deg * labels.iter().sum::<f64>() / labels.len() as f64;
+        let labels: Vec<f64> = rows.map(|row| row[4].parse::<f64>().unwrap()).collect();
+        let expected =
+            full_lock_deg * labels.iter().map(|label| (label - answer).abs()).sum::<f64>() / labels.len() as f64;
+        approx::assert_relative_eq!(result["val_mae_deg"].as_f64().unwrap(), expected, max_relative = 1e-4);
+        approx::assert_relative_eq!(history[0].val_mae_deg.unwrap(), expected, max_relative = 1e-4);
+        (labels, expected, result)
+    };
+    for full_lock_deg in [25.0, 40.0] {
+        let (mut labels, expected, result) = run(full_lock_deg, 0.0);
         assert!(expected > 1.0, "labels far enough from 0 to tell units apart");
-        approx::assert_relative_eq!(result["val_mae_deg"].as_f64().unwrap(), expected, max_relative = 1e-5);
-        approx::assert_relative_eq!(history[0].val_mae_deg.unwrap(), expected, max_relative = 1e-5);
         approx::assert_relative_eq!(result["relative_to_zero"].as_f64().unwrap(), 1.0, max_relative = 1e-5);
+        labels.sort_by(f64::total_cmp);
+        let middle = 0.5 * (labels[0] + labels[labels.len() - 1]);
+        let (_, between, _) = run(full_lock_deg, middle);
+        assert!(between > 0.1, "labels on both sides of {middle}, far enough from it");
     }
 }
 

@@ -16,7 +16,7 @@ use crate::main_job::experiment::{
     self, ExperimentEvent, ExperimentPlan, ExperimentRow, Subject, keyboard_drives, takes, write_csv,
 };
 use crate::main_job::job::{RECORDINGS, training_set};
-use crate::main_job::training_set::RANDOM_TRACKS;
+use crate::main_job::training_set::{RANDOM_TRACKS, labelled};
 use crate::observer::Observer;
 use crate::simulator::Track;
 
@@ -134,7 +134,7 @@ pub fn run(args: ExperimentArgs) -> Result<()> {
         true if labels => pool.install(|| keyboard_drives(scratch.path(), &mut display, &stop)),
         true => {
             let takes = takes(args.random_tracks.unwrap_or(USUAL_RANDOM_TRACKS) as usize);
-            pool.install(|| training_set(RECORDINGS.as_ref(), &takes, None, &mut display, &stop))
+            pool.install(|| training_set(RECORDINGS.as_ref(), &labelled(&takes, &recipe), None, &mut display, &stop))
         }
         false => Ok(given),
     };

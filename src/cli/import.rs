@@ -15,7 +15,7 @@ use crate::dataset::resize::Interpolation;
 use crate::engine::network::Network;
 use crate::engine::tensor::Shape;
 use crate::error::{Error, Result};
-use crate::exchange::fit::{self, Candidate, Frames};
+use crate::exchange::fit::{self, Agreement, Candidate, Frames};
 use crate::exchange::keras::{self, ImportOptions, LayerReport};
 use crate::exchange::presets;
 use crate::model_file::weights_hash;
@@ -32,7 +32,8 @@ pub struct ImportArgs {
     /// udacity-bgr), that of a built-in recipe, or a TOML file
     #[arg(long, value_name = "NAME|FILE")]
     preprocessing: Option<String>,
-    /// Try the plausible preprocessings on a recording and rank them; without --preprocessing, --out takes the best
+    /// Try the plausible preprocessings on a recording, rank them by the error that the best gain and bias leave, and say which gain and
+    /// bias; without --preprocessing, --out takes the best
     #[arg(long, value_name = "RECORDING")]
     fit: Option<PathBuf>,
     #[command(flatten)]
@@ -60,6 +61,10 @@ pub struct ImportArgs {
 
 /// A model under the right preprocessing goes with the labels better than this.
 const WEAK_CORRELATION: f64 = 0.3;
+
+/// Gains from the first to the second, and biases up to the third, need no `--output-scale`: another driver's hands explain them.
+const USUAL_GAIN: std::ops::RangeInclusive<f64> = 0.4..=2.5;
+const USUAL_BIAS: f64 = 0.2;
 
 fn parse_lambda(text: &str) -> Result<(String, (f64, f64)), String> {
     let (layer, numbers) = text.split_once('=').ok_or("expected LAYER=A,B, as in lambda_1=127.5,1")?;
@@ -97,7 +102,8 @@ struct Answer {
 
 #[derive(Serialize)]
 struct Fit {
-    correlation: Option<f64>,
+    #[serde(flatten)]
+    agreement: Agreement,
     preprocessing: Preprocessing,
 }
 
@@ -131,7 +137,7 @@ pub fn run(args: ImportArgs) -> Result<()> {
             let pool = pool(args.threads)?;
             let recording = pool.install(|| args.reading.load(recording))?;
             let frames = pool.install(|| Frames::of(&recording))?;
-            let count = fit::combinations(&network).len();
+            let count = fit::combinations(&network, frames.source()).len();
             eprintln!("trying {count} combinations on up to {} frames of {}", frames.len(), recording.path.display());
             pool.install(|| fit::rank(&network, &imported.parameters, &frames, given.as_ref()))?
         }
@@ -139,17 +145,7 @@ pub fn run(args: ImportArgs) -> Result<()> {
     };
     let preprocessing = match (given, ranking.first()) {
         (Some(given), _) => given,
-        (None, Some(best)) => {
-            if best.correlation.is_none_or(|correlation| correlation < WEAK_CORRELATION) {
-                eprintln!(
-                    "warning: no preprocessing fits: the best one has a correlation of {} with the labels. The right one may \
-                     not be among those that were tried, or the model was trained for another kind of picture; name it with \
-                     --preprocessing",
-                    or_dash(best.correlation, 3)
-                );
-            }
-            best.preprocessing.clone()
-        }
+        (None, Some(best)) => best.preprocessing.clone(),
         (None, None) => {
             let guess = whole_image(imported.input)?;
             eprintln!(
@@ -161,6 +157,12 @@ pub fn run(args: ImportArgs) -> Result<()> {
             guess
         }
     };
+
+    if let Some(taken) = ranking.iter().find(|candidate| candidate.preprocessing == preprocessing) {
+        for warning in fit_warnings(&taken.agreement, args.output_scale) {
+            eprintln!("warning: {warning}");
+        }
+    }
 
     let mut text = layer_table(&imported.report);
     text += &ranking_table(&ranking);
@@ -176,7 +178,7 @@ pub fn run(args: ImportArgs) -> Result<()> {
         weights: weights_hash(&network, &imported.parameters),
         fit: ranking
             .into_iter()
-            .map(|Candidate { preprocessing, correlation }| Fit { correlation, preprocessing })
+            .map(|Candidate { preprocessing, agreement }| Fit { agreement, preprocessing })
             .collect(),
         model: args.out.clone(),
     };
@@ -219,31 +221,72 @@ fn layer_table(report: &[LayerReport]) -> String {
     text
 }
 
+/// What the user should know of the outputs under the preprocessing that is taken. `output_scale` is what they were read with.
+fn fit_warnings(agreement: &Agreement, output_scale: Option<[f64; 2]>) -> Vec<String> {
+    let mut warnings: Vec<String> = agreement.absurdity().into_iter().collect();
+    let (line, r) = match (agreement.line, agreement.correlation) {
+        (Some(line), Some(r)) if r.abs() >= WEAK_CORRELATION => (line, r),
+        (_, r) => {
+            warnings.push(format!(
+                "no preprocessing fits: the correlation with the labels is {} under the one that is taken. The right one may not be \
+                 among those that were tried, or the model was trained for another kind of picture; name it with --preprocessing",
+                or_dash(r, 3)
+            ));
+            return warnings;
+        }
+    };
+    if r < 0.0 {
+        warnings.push(format!(
+            "the outputs are mirrored: where the labels say right they say left (gain {:.3})",
+            line.gain
+        ));
+    }
+    if !USUAL_GAIN.contains(&line.gain) || line.bias.abs() > USUAL_BIAS {
+        let [straight, span] = line.output_scale(output_scale.unwrap_or([0.0, 1.0]));
+        // Four digits of the span.
+        let decimals = (3.0 - span.abs().log10().floor()).clamp(0.0, 12.0) as usize;
+        // No minus in front of zeros.
+        let straight = if straight.abs() < 0.5 * 10f64.powi(-(decimals as i32)) { 0.0 } else { straight };
+        warnings.push(format!(
+            "the outputs come nearest to the labels times {:.3} {:+.3}: either this is not the right preprocessing, or the model gives \
+             another unit than shares of full lock; then import with --output-scale {straight:.decimals$},{span:.decimals$}, or \
+             the round numbers near it that its makers chose",
+            line.gain, line.bias
+        ));
+    }
+    warnings
+}
+
 fn ranking_table(ranking: &[Candidate]) -> String {
     if ranking.is_empty() {
         return String::new();
     }
     let mut text = format!(
-        "\n{:>11}  {:<12} {:<12} {:<14} {:<8} {}\n",
-        "correlation", "colour", "rows", "resize", "method", "input"
+        "\nerror: root of the mean squared difference from the labels, where 1 is full lock, after the best gain and bias; as is: without \
+         them\n{:>7} {:>8} {:>8} {:>8} {:>11}  {:<8} {:<12} {:<14} {:<14} {}\n",
+        "error", "as is", "gain", "bias", "correlation", "colour", "rows", "resize", "method", "input"
     );
-    for Candidate { preprocessing: p, correlation } in ranking {
+    for Candidate { preprocessing: p, agreement } in ranking {
         let colour = p.colour.name();
         let method = match p.interpolation {
             Interpolation::Linear => "linear",
             Interpolation::Area => "area",
         };
+        let method = if p.blur { format!("blur, {method}") } else { method.into() };
         let rows = format!("{} to {}", p.rows[0], p.rows[1]);
         let size = format!("{}x{}{}", p.resize[0], p.resize[1], if p.colour_first { " after" } else { "" });
         let scaling = match (p.scale, p.offset) {
             (1.0, 0.0) => "grey levels".to_string(),
             (scale, offset) => format!("x / {} {offset:+}", 1.0 / scale),
         };
+        let line = agreement.line;
         text += &format!(
-            "{:>11}  {:<12} {rows:<12} {size:<14} {:<8} {scaling}\n",
-            or_dash(*correlation, 3),
-            colour,
-            method,
+            "{:>7} {:>8} {:>8} {:>8} {:>11}  {colour:<8} {rows:<12} {size:<14} {method:<14} {scaling}\n",
+            or_dash(line.map(|line| line.error), 3),
+            or_dash(agreement.error, 3),
+            or_dash(line.map(|line| line.gain), 3),
+            or_dash(line.map(|line| line.bias), 3),
+            or_dash(agreement.correlation, 3),
         );
     }
     text
@@ -267,6 +310,32 @@ mod tests {
         for wrong in ["90", "90,0", "x,1", "nan,1", "1,inf"] {
             assert!(parse_output_scale(wrong).is_err(), "{wrong}");
         }
+    }
+
+    /// Outputs 90 + 45 · label, and their opposite, as they are and with a unit that was named.
+    #[test]
+    fn a_fit_tells_mirrored_outputs_and_other_units() {
+        let labels = || (-4..5).map(|i| f64::from(i) / 10.0);
+        let warnings = |of: fn(f64) -> f64, scale| {
+            let pairs: Vec<(f64, f64)> = labels().map(|label| (of(label), label)).collect();
+            fit_warnings(&Agreement::of(&pairs), scale)
+        };
+        assert!(warnings(|label| 0.8 * label + 0.05, None).is_empty());
+        let mirrored = warnings(|label| -label, None);
+        assert!(mirrored[0].contains("mirrored") && mirrored[0].contains("gain -1.000"), "{mirrored:?}");
+        assert!(mirrored[1].contains("--output-scale 0.000,-1.000"), "{mirrored:?}");
+        let degrees = warnings(|label| 90.0 + 45.0 * label, None);
+        assert!(degrees[0].contains("9 of 9 outputs lie beyond 2"), "{degrees:?}");
+        assert!(degrees[1].contains("--output-scale 90.00,45.00"), "{degrees:?}");
+        let misread = warnings(|label| (90.0 + 45.0 * label - 80.0) / 10.0, Some([80.0, 10.0]));
+        assert!(misread.iter().any(|warning| warning.contains("--output-scale 90.00,45.00")), "{misread:?}");
+        let unrelated = warnings(|label| (label * 100.0).sin(), None);
+        assert!(unrelated.len() == 1 && unrelated[0].contains("no preprocessing fits"), "{unrelated:?}");
+        let constant = warnings(|_| 0.25, None);
+        assert!(
+            constant[0].contains("whatever") && constant[1].contains("correlation with the labels is -"),
+            "{constant:?}"
+        );
     }
 
     #[test]

@@ -220,7 +220,7 @@ fn recipe_entry(error: &clap::Error, args: Vec<String>) -> Option<String> {
 /// Which recipe, and what to change in it.
 #[derive(Clone, Debug, Args)]
 struct RecipeArgs {
-    /// A built-in recipe (default, recording, hyper, hyper-prelu, lenet, pilotnet) or a recipe file [default: recording
+    /// A built-in recipe (default, calm, recording, hyper, hyper-prelu, lenet, pilotnet, donkey) or a recipe file [default: recording
     /// with a recording, else default]
     #[arg(long, value_name = "NAME|FILE")]
     recipe: Option<String>,

@@ -19,7 +19,7 @@ pub struct RecordArgs {
     #[arg(long)]
     track: String,
     /// Drive yourself, with keyboard, mouse or gamepad, on a page in a browser of this machine; Ctrl-C ends and saves
-    #[arg(long, conflicts_with_all = ["laps", "recovery", "style", "noise", "threads", "slower_in_bends", "camera"])]
+    #[arg(long, conflicts_with_all = ["laps", "recovery", "style", "noise", "threads", "slower_in_bends", "camera", "label_ahead"])]
     manual: bool,
     /// Port of the page, on this machine only; 0 takes any free one
     #[arg(long, default_value_t = DEFAULT_PORT, requires = "manual")]
@@ -45,6 +45,10 @@ pub struct RecordArgs {
     /// Drive slower than --speed before and in bends, so that the car is pushed sideways by at most MPS2, m/s² [default: 2.5]
     #[arg(long, value_name = "MPS2", num_args = 0..=1, require_equals = true, default_missing_value = "2.5")]
     slower_in_bends: Option<f64>,
+    /// Label with the steering towards the point of the line METRES ahead (3 to 30) instead of what the expert steers: smaller from farther
+    /// away, so that a model's errors about its place move the wheel less
+    #[arg(long, value_name = "METRES")]
+    label_ahead: Option<f64>,
     /// Standard deviation of a disturbance of the steering that the labels do not show
     #[arg(long, default_value_t = 0.0)]
     noise: f64,
@@ -99,6 +103,7 @@ pub fn run(args: RecordArgs) -> Result<()> {
         seed: args.seed,
         speed_mph: args.speed,
         bends_mps2: args.slower_in_bends,
+        label_ahead_m: args.label_ahead,
         noise: args.noise,
         hz: args.hz,
         format: match args.format {

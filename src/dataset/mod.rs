@@ -30,6 +30,7 @@ pub use exclusions::Exclusions;
 pub use formats::{table as table_of_formats, udacity_writer};
 pub(crate) use load::load_rows;
 pub use load::{load, load_with, recordings_below};
+pub(crate) use pictures::blur;
 pub use pictures::{cache, colour, preprocess, resize};
 pub use recording::{Recording, Row, SESSION_GAP_MS, View};
 pub use rows::ImageCheck;

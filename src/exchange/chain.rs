@@ -29,6 +29,7 @@ impl ChainStep {
             | ExportForm::AveragePool { .. }
             | ExportForm::Crop { .. }
             | ExportForm::ZeroPad { .. }
+            | ExportForm::Resize { .. }
             | ExportForm::Flatten => 0,
         }
     }
@@ -86,6 +87,7 @@ pub(crate) fn check_finite(steps: &[ChainStep]) -> Result<()> {
             | ExportForm::AveragePool { .. }
             | ExportForm::Crop { .. }
             | ExportForm::ZeroPad { .. }
+            | ExportForm::Resize { .. }
             | ExportForm::Flatten => true,
         };
         if !is_finite {

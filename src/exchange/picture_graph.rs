@@ -4,6 +4,7 @@
 //! Between operations a picture is a float tensor of whole numbers from 0 to 255. Floats hold integers below 2²⁴ exactly, so
 //! the graph computes these in floats and larger ones in 32-bit integers. The area method adds its sums in the engine's order.
 
+use crate::dataset::blur::neighbours;
 use crate::dataset::colour::{Colour, HSV, L_SCALE, L_SHIFT, LAB};
 use crate::dataset::preprocess::Preprocessing;
 use crate::dataset::resize::{AreaTaps, LinearTap, Method, Resizer};
@@ -70,7 +71,10 @@ pub(crate) trait PictureGraph {
 pub(crate) fn add<G: PictureGraph>(graph: &mut G, spec: &Preprocessing, x: &str) -> String {
     let mut pictures = Pictures { graph };
     let [first, end] = spec.rows;
-    let resizer = Resizer::new([end - first, spec.source[1]], spec.resize, 1, spec.interpolation);
+    let kept = [end - first, spec.source[1]];
+    let resizer = Resizer::new(kept, spec.resize, 1, spec.interpolation);
+    let blurred = if spec.blur { pictures.blur(kept, x) } else { x.into() };
+    let x = blurred.as_str();
     if spec.colour_first {
         let x = pictures.colour(spec.colour, x);
         pictures.resize(&resizer, &x)
@@ -85,6 +89,21 @@ struct Pictures<'a, G> {
 }
 
 impl<G: PictureGraph> Pictures<'_, G> {
+    /// The weights 1, 2, 1 in each direction, and a sixteenth of it rounded half up. All sums are whole numbers below 2^24.
+    fn blur(&mut self, [h, w]: [usize; 2], x: &str) -> String {
+        let mut sum = x.to_string();
+        for (axis, n) in [(Axis::Row, h), (Axis::Column, w)] {
+            let [before, after] = [0, 1].map(|side| {
+                let positions: Vec<usize> = (0..n).map(|i| neighbours(i, n)[side]).collect();
+                self.graph.gather(&sum, axis, &positions)
+            });
+            let sides = self.graph.op(Op::Add, &[&before, &after]);
+            let twice = self.with(Op::Mul, &sum, 2.0);
+            sum = self.graph.op(Op::Add, &[&sides, &twice]);
+        }
+        self.descale(&sum, 4)
+    }
+
     fn resize(&mut self, resizer: &Resizer, x: &str) -> String {
         match resizer.method() {
             Method::Copy => x.into(),

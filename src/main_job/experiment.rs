@@ -9,6 +9,7 @@ use serde_json::Value;
 
 use super::job::{JobEvent, observed, test_on_tracks};
 use super::{TrackResult, training_set};
+use crate::dataset::augment::Augmentation;
 use crate::dataset::colour::Colour;
 use crate::dataset::split::SplitMode;
 use crate::dataset::{Description, LabelKind, LabelSpec};
@@ -34,12 +35,15 @@ pub enum Subject {
     Colour,
     /// What labels are: the recorded wheel, or the steering that follows the driven path, with look-aheads of 0.7, 1.0 and 1.3 s.
     Labels,
-    /// What makes the wheel calm: the recipe as it is, averaged weights, each term of smoothness, blur before each stride, all of them.
+    /// What makes the wheel calm: the recipe with none of them, averaged weights, noise in the pictures, each term of smoothness, blur before
+    /// each stride, all of them.
     Smooth,
 }
 
-/// Decay of the averaged weights, and weights of the smoothness terms, of [`Subject::Smooth`].
+/// Decay of the averaged weights, amplitudes of the noise of pixels and blocks in grey levels, and weights of the smoothness terms, of
+/// [`Subject::Smooth`].
 const DECAY: f64 = 0.998;
+const NOISE: [f64; 2] = [48.0, 16.0];
 const TERM: f64 = 2.0;
 
 /// Seed of the first drive of [`keyboard_drives`]; far from those of the training set and of drives.
@@ -81,17 +85,25 @@ impl Subject {
                 .to_vec()
             }
             Subject::Smooth => {
-                let plain = || Recipe { averaging: None, smoothness: None, ..base.clone() };
+                let with_noise = |[pixel_noise, block_noise]: [f64; 2]| Augmentation {
+                    pixel_noise,
+                    block_noise,
+                    ..base.augmentation.clone()
+                };
+                let plain =
+                    || Recipe { averaging: None, smoothness: None, augmentation: with_noise([0.0; 2]), ..base.clone() };
+                let augmentation = with_noise(NOISE);
                 let averaging = Some(AveragingSpec::Ema { decay: DECAY, from_share: 0.0, refit_batches: 0 });
                 let terms = |spatial, temporal| Some(Smoothness { spatial, temporal, ..Smoothness::default() });
                 let layers = blurred(&base.layers);
                 vec![
                     ("plain", plain()),
                     ("averaged", Recipe { averaging, ..plain() }),
+                    ("noise", Recipe { augmentation: augmentation.clone(), ..plain() }),
                     ("spatial", Recipe { smoothness: terms(TERM, 0.0), ..plain() }),
                     ("temporal", Recipe { smoothness: terms(0.0, TERM), ..plain() }),
                     ("blur", Recipe { layers: layers.clone(), ..plain() }),
-                    ("together", Recipe { averaging, smoothness: terms(TERM, TERM), layers, ..plain() }),
+                    ("together", Recipe { averaging, augmentation, smoothness: terms(TERM, TERM), layers, ..plain() }),
                 ]
             }
         }
@@ -332,6 +344,7 @@ mod tests {
                     recipe.split.mode = base.split.mode;
                     recipe.preprocessing.colour = base.preprocessing.colour;
                     (recipe.averaging, recipe.smoothness) = (base.averaging, base.smoothness);
+                    recipe.augmentation.clone_from(&base.augmentation);
                     recipe.labels = base.labels;
                     recipe.layers.clone_from(&base.layers);
                     assert_eq!(recipe, base);
@@ -355,19 +368,22 @@ mod tests {
     fn what_makes_the_wheel_calm_is_tried_alone_and_together() {
         let base = Recipe::find("default", &[]).unwrap();
         let variants = Subject::Smooth.variants(&base);
-        assert_eq!(variants[0], ("plain", base.clone()));
+        let plain = &variants[0].1;
+        assert_eq!((plain.averaging, plain.smoothness), (None, None));
+        assert_eq!((plain.augmentation.pixel_noise, plain.augmentation.block_noise), (0.0, 0.0));
         for (name, recipe) in &variants {
             // Each is a recipe that could be written and read.
             let read = Recipe::parse(name, &recipe.to_toml().unwrap(), &[]).unwrap_or_else(|e| panic!("{name}: {e}"));
             assert_eq!(read, *recipe);
         }
         let differences = |recipe: &Recipe| {
-            [recipe.averaging.is_some(), recipe.smoothness.is_some(), recipe.layers != base.layers].map(u8::from)
+            let noise = recipe.augmentation != plain.augmentation;
+            [recipe.averaging.is_some(), noise, recipe.smoothness.is_some(), recipe.layers != base.layers].map(u8::from)
         };
         let found: Vec<_> = variants.iter().map(|(_, recipe)| differences(recipe)).collect();
-        assert_eq!(found, [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]]);
-        let blurs = variants[4].1.layers.iter().filter(|layer| layer.base_name() == "blur").count();
-        assert_eq!((blurs, variants[4].1.layers[1].base_name()), (3, "blur"));
+        assert_eq!(found, [[0; 4], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 1, 0], [0, 0, 0, 1], [1; 4]]);
+        let blurs = variants[5].1.layers.iter().filter(|layer| layer.base_name() == "blur").count();
+        assert_eq!((blurs, variants[5].1.layers[1].base_name()), (3, "blur"));
     }
 
     #[test]

@@ -171,7 +171,8 @@ impl<'a> Job<'a> {
         for round in 1..=self.note.dagger_rounds {
             RunFolder::require_free(&dagger_folder(&out, 0, round)?)?;
         }
-        let recordings = training_set(&self.scope.recordings, &self.scope.takes, None, self.observer, self.stop)?;
+        let takes = training_set::labelled(&self.scope.takes, &recipe);
+        let recordings = training_set(&self.scope.recordings, &takes, None, self.observer, self.stop)?;
         let profile = self.profile;
         let training = self.train(TrainRequest {
             recordings,
@@ -239,9 +240,10 @@ impl<'a> Job<'a> {
         let folder = RunFolder::open(&path)?;
         let (info, recipe) = (folder.info()?, folder.recipe()?);
         let pilot = Pilot::load(&training.model)?;
-        let (what, takes) = (format!("the model drives, the expert labels (round {round})"), &self.scope.takes);
+        let takes = training_set::labelled(&self.scope.takes, &recipe);
+        let what = format!("the model drives, the expert labels (round {round})");
         let recorded = observed(what, self.observer, self.stop, |observer| {
-            dagger::recordings(&pilot, takes, &path.join("dagger"), round, observer)
+            dagger::recordings(&pilot, &takes, &path.join("dagger"), round, observer)
         })?;
         let algorithm = Some(info.conv_algorithm(&folder)?);
         let mut recordings = info.recordings;

@@ -10,6 +10,7 @@ use crate::error::{Error, Result};
 use crate::files::new_folder::NewFolder;
 use crate::geometry::CarGeometry;
 use crate::observer::{Observer, Parts, Progress};
+use crate::recipe::Recipe;
 use crate::simulator::{RecordOptions, Track, record};
 
 /// Random tracks in the set. Variety of looks teaches more than laps: each is driven for a fraction of a lap.
@@ -24,7 +25,7 @@ const HZ: u64 = 5;
 const FIRST_SEED: u64 = 101;
 
 /// One recording of the set.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Take {
     /// Track as on the command line.
     pub track: String,
@@ -36,6 +37,9 @@ pub struct Take {
     pub recovery: bool,
     /// Draws start, light and texture.
     pub seed: u64,
+    /// See [`RecordOptions::label_ahead_m`].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub label_ahead_m: Option<f64>,
 }
 
 impl Take {
@@ -53,6 +57,7 @@ impl Take {
             recovery: self.recovery,
             seed: self.seed,
             hz: HZ,
+            label_ahead_m: self.label_ahead_m,
             car: car.cloned(),
             ..Default::default()
         }
@@ -65,7 +70,7 @@ pub fn takes() -> Vec<Take> {
     let mut takes = Vec::new();
     let mut take = |track: &str, laps, reverse, recovery| {
         let seed = FIRST_SEED + takes.len() as u64;
-        takes.push(Take { track: track.into(), laps, reverse, recovery, seed });
+        takes.push(Take { track: track.into(), laps, reverse, recovery, seed, ..Take::default() });
     };
     for track in ["lake", "mountain"] {
         for (laps, recovery) in [(0.8, false), (0.4, true)] {
@@ -80,6 +85,12 @@ pub fn takes() -> Vec<Take> {
         take(&track, 0.15, !odd, true);
     }
     takes
+}
+
+/// `takes` with labels as `recipe` wants them of the expert.
+pub fn labelled(takes: &[Take], recipe: &Recipe) -> Vec<Take> {
+    let label_ahead_m = recipe.labels.expert_ahead_m;
+    takes.iter().map(|take| Take { label_ahead_m, ..take.clone() }).collect()
 }
 
 /// Everything that determines a set recorded as `car`, as text: the same text gives the same pictures.
@@ -182,12 +193,30 @@ mod tests {
     use crate::simulator::{Camera, Mount, Renderer, RgbFrame, Variant};
 
     #[test]
+    fn a_recipe_that_looks_farther_ahead_has_a_set_of_its_own() {
+        let [default, calm] = ["default", "calm"].map(|name| Recipe::find(name, &[]).unwrap());
+        let takes = takes();
+        assert_eq!(labelled(&takes, &default), takes);
+        let ahead = labelled(&takes, &calm);
+        assert!(ahead.iter().all(|take| take.options(None).label_ahead_m == Some(10.0)));
+        assert!(settings(&ahead, None).unwrap() != settings(&takes, None).unwrap());
+        assert!(!settings(&takes, None).unwrap().contains("label_ahead_m"));
+    }
+
+    #[test]
     fn the_hash_of_the_simulator_is_that_of_what_it_draws_and_drives() {
         let mut hash = Sha256::new();
         let (mut renderer, mut frame) = (Renderer::default(), RgbFrame::default());
         for (name, recovery) in [("lake", false), ("mountain", true), ("random:1", false), ("random:2", true)] {
             let track = Track::load(name).unwrap();
-            let take = Take { track: name.into(), laps: 1.0, reverse: recovery, recovery, seed: FIRST_SEED };
+            let take = Take {
+                track: name.into(),
+                laps: 1.0,
+                reverse: recovery,
+                recovery,
+                seed: FIRST_SEED,
+                ..Default::default()
+            };
             let (variant, samples) =
                 (Variant::new(track.world(), take.seed), drive_expert(&track, &take.options(None)));
             for (k, sample) in samples.iter().enumerate() {
@@ -232,8 +261,14 @@ mod tests {
     }
 
     fn few() -> Vec<Take> {
-        let take =
-            |track: &str, recovery, seed| Take { track: track.into(), laps: 0.01, reverse: true, recovery, seed };
+        let take = |track: &str, recovery, seed| Take {
+            track: track.into(),
+            laps: 0.01,
+            reverse: true,
+            recovery,
+            seed,
+            ..Default::default()
+        };
         vec![take("lake", false, 1), take("lake", true, 2), take("random:4", false, 3)]
     }
 

@@ -72,7 +72,8 @@ mod tests {
     fn the_set_is_recorded_with_the_recordings_camera_and_by_itself_for_the_simulators() {
         let scratch = tempfile::tempdir().unwrap();
         let folder = scratch.path();
-        let takes = [Take { track: "lake".into(), laps: 0.01, reverse: false, recovery: false, seed: 3 }];
+        let takes =
+            [Take { track: "lake".into(), laps: 0.01, reverse: false, recovery: false, seed: 3, ..Take::default() }];
         let set = |recordings: &[PathBuf]| {
             let sets = folder.join("sets");
             simulator_set(&sets, &takes, recordings, &Description::default(), &mut Unobserved, &StopSignal::default())

@@ -281,6 +281,7 @@ pub(super) fn record(
         seed,
         speed_mph,
         bends_mps2: settings.slower_in_bends_mps2,
+        label_ahead_m: None,
         noise,
         hz,
         format: match settings.format.as_str() {

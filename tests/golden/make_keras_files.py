@@ -13,6 +13,7 @@ import sys
 import h5py
 import keras
 import numpy as np
+import tensorflow as tf
 from formula import unit
 from keras import layers
 
@@ -147,6 +148,55 @@ def degrees():
     ], name="degrees")
     model.build((None, 48, 90, 3))
     return model
+
+
+def resized():
+    """Resizing by ratios that are not whole, down and up, of pictures and of maps."""
+    return keras.Sequential([
+        layers.Input((31, 43, 3)),
+        layers.Resizing(20, 27),
+        layers.Rescaling(1 / 127.5, offset=-1.0),
+        layers.Conv2D(4, 5, strides=2, activation="elu"),
+        layers.Resizing(5, 9, interpolation="nearest"),
+        layers.Conv2D(5, 3, activation="tanh"),
+        layers.Resizing(7, 4),
+        layers.Flatten(),
+        layers.Dense(1),
+    ], name="resized")
+
+
+def area():
+    """Keras 2 resized by area, too; Keras 3 does not, but TensorFlow does."""
+    return keras.Sequential([
+        layers.Input((31, 43, 3)),
+        layers.Lambda(lambda x: tf.image.resize(x, (20, 27), method="area"), name="resizing"),
+        layers.Rescaling(1 / 127.5, offset=-1.0, name="rescaling"),
+        layers.Conv2D(4, 5, strides=2, activation="elu", name="conv"),
+        layers.Lambda(lambda x: tf.image.resize(x, (5, 9), method="area"), name="resizing_1"),
+        layers.Flatten(name="flatten"),
+        layers.Dense(1, name="steering"),
+    ], name="area")
+
+
+def keras2_area(model):
+    """The file of `area` as Keras 2 wrote it."""
+    conv = {"filters": 4, "kernel_size": [5, 5], "strides": [2, 2], "padding": "valid", "data_format": "channels_last",
+            "dilation_rate": [1, 1], "activation": "elu", "use_bias": True}
+    resizing = lambda height, width: {"height": height, "width": width, "interpolation": "area", "crop_to_aspect_ratio": False}
+    config = [
+        ("InputLayer", "input_1", {"batch_input_shape": [None, 31, 43, 3], "dtype": "float32", "sparse": False}),
+        ("Resizing", "resizing", resizing(20, 27)),
+        ("Rescaling", "rescaling", {"scale": 1 / 127.5, "offset": -1.0}),
+        ("Conv2D", "conv", conv),
+        ("Resizing", "resizing_1", resizing(5, 9)),
+        ("Flatten", "flatten", {"data_format": "channels_last"}),
+        ("Dense", "steering", {"units": 1, "activation": "linear", "use_bias": True}),
+    ]
+    with h5py.File(OUT / "keras2-area.h5", "w") as f:
+        f.attrs["keras_version"] = b"2.11.0"
+        f.attrs["backend"] = b"tensorflow"
+        f.attrs["model_config"] = json.dumps(chain(config)).encode()
+        write_layers(f.create_group("model_weights"), model, [name for _, name, _ in config], keras2_name)
 
 
 def lambda_code(base64):
@@ -328,7 +378,7 @@ def hostile():
 def main():
     OUT.mkdir(exist_ok=True)
     expected = {"keras": keras.__version__, "images": IMAGES}
-    for seed, build in enumerate([keras3, functional, plain, donkey, degrees]):
+    for seed, build in enumerate([keras3, functional, plain, donkey, degrees, resized, area]):
         model = build()
         randomise(model, seed)
         shape = model.input_shape[1:]
@@ -338,6 +388,8 @@ def main():
         if build is plain:
             hand_made(model)
             with_slashes(model)
+        elif build is area:
+            keras2_area(model)
         else:
             model.save(OUT / f"{build.__name__}.keras")
             # Keras 3.15 cannot write random layers into HDF5.

@@ -60,7 +60,7 @@ CONVERSIONS = {
 }
 
 
-def case(name, image, size, rows=None, resize=None, interpolation="linear", colour="rgb", colour_first=False):
+def case(name, image, size, rows=None, resize=None, interpolation="linear", colour="rgb", colour_first=False, blur=False):
     return {
         "name": name,
         "image": image,
@@ -70,6 +70,7 @@ def case(name, image, size, rows=None, resize=None, interpolation="linear", colo
         "interpolation": interpolation,
         "colour": colour,
         "colour_first": colour_first,
+        "blur": blur,
     }
 
 
@@ -91,6 +92,10 @@ CASES = [
     case("linear 160x320 to 208x416", "road", FRAME, None, (208, 416)),
     case("linear 50x70 to 65x50", "road", (50, 70), None, (65, 50)),
     case("linear 120x160 to 160x320", "road", (120, 160), None, (160, 320)),
+    # Smoothed before.
+    case("blur", "road", (50, 70), blur=True),
+    case("blur 90x320 to 66x200", "road", FRAME, (50, 140), (66, 200), "area", "yuv", blur=True),
+    case("blur colours", "colours", (64, 64), None, (33, 41), colour="hsv", colour_first=True, blur=True),
     # Colour spaces by themselves.
     *(case(f"colour {colour}", "colours", (64, 64), colour=colour) for colour in CONVERSIONS if colour != "rgb"),
 ]
@@ -99,6 +104,8 @@ CASES = [
 def output(c):
     """The planar [c][h][w] result of one case."""
     image = IMAGES[c["image"]](*c["size"])[c["rows"][0] : c["rows"][1]]
+    if c["blur"]:
+        image = cv2.GaussianBlur(image, (3, 3), 0)
     if c["colour_first"]:
         image = CONVERSIONS[c["colour"]](image)
     height, width = c["resize"]

@@ -2,7 +2,7 @@
 //!
 //! The stages, in order:
 //! 1. scale the image to the `source` size, if it has another one;
-//! 2. keep the rows that show the road;
+//! 2. keep the rows that show the road; with `blur` smooth them;
 //! 3. resize, rounded to 8 bits;
 //! 4. convert the colours, to planes `[c][h][w]` (with `colour_first` before stage 3);
 //! 5. network input = grey level * `scale` + `offset`.
@@ -10,6 +10,7 @@
 //! The last RGB picture on this way, the *RGB stage*, is where augmentation acts: the resized picture, or with
 //! `colour_first` the kept rows. [`Preprocessor`] can stop there and go on later.
 
+use super::blur::Blur;
 use super::colour::Colour;
 use super::resize::{Interpolation, Resizer};
 use crate::{Error, Result};
@@ -27,6 +28,9 @@ pub struct Preprocessing {
     pub source: [usize; 2],
     /// Rows kept, from the first to before the second.
     pub rows: [usize; 2],
+    /// Smooth the kept rows with a Gaussian of 3x3 pixels, weights 1, 2, 1 in each direction.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub blur: bool,
     /// Height and width of the network's input, in pixels.
     pub resize: [usize; 2],
     /// How the kept rows are resized.
@@ -47,6 +51,7 @@ impl Default for Preprocessing {
         Self {
             source: [160, 320],
             rows: [0, 160],
+            blur: false,
             resize: [160, 320],
             interpolation: Interpolation::Linear,
             colour: Colour::Rgb,
@@ -137,6 +142,7 @@ impl Preprocessing {
             source_image: vec![0; if to_source.is_some() { self.source[0] * self.source[1] * 3 } else { 0 }],
             rgb: vec![0; self.rgb_len()],
             kept_planes: vec![0; if self.colour_first { kept[0] * kept[1] * channels } else { 0 }],
+            blur: self.blur.then(|| (Blur::new(kept), vec![0; kept[0] * kept[1] * 3])),
             from,
             to_source,
             resizer,
@@ -159,6 +165,8 @@ pub struct Preprocessor {
     spec: Preprocessing,
     from: [usize; 2],
     to_source: Option<Resizer>,
+    /// With its result.
+    blur: Option<(Blur, Vec<u8>)>,
     resizer: Resizer,
     source_image: Vec<u8>,
     rgb: Vec<u8>,
@@ -201,7 +209,11 @@ impl Preprocessor {
         };
         let [height, width] = self.spec.source;
         assert_eq!(image.len(), height * width * 3, "image of {:?} pixels", self.from);
-        let kept = &image[self.spec.rows[0] * width * 3..self.spec.rows[1] * width * 3];
+        let mut kept = &image[self.spec.rows[0] * width * 3..self.spec.rows[1] * width * 3];
+        if let Some((blur, blurred)) = &mut self.blur {
+            blur.apply(kept, blurred);
+            kept = blurred;
+        }
         if self.spec.colour_first { rgb.copy_from_slice(kept) } else { self.resizer.apply(kept, rgb) }
     }
 
@@ -246,11 +258,26 @@ mod tests {
     }
 
     #[test]
+    fn the_kept_rows_are_smoothed_before_they_are_resized() {
+        // Rows 0, 0, 160, 0, 0, 240, 0, 0; the last lies outside of what is kept, and so does its light.
+        let image: Vec<u8> = [0, 0, 160, 0, 0, 240, 0, 0].into_iter().flat_map(|grey| [grey; 12 * 3]).collect();
+        let spec = Preprocessing { rows: [1, 5], resize: [4, 12], blur: true, ..small() };
+        let mut planes = vec![0; spec.output_len()];
+        spec.plan(8, 12).unwrap().apply(&image, &mut planes);
+        let column: Vec<u8> = planes.iter().step_by(12).copied().take(4).collect();
+        assert_eq!(column, [80, 80, 40, 0]);
+        let halved = Preprocessing { resize: [2, 6], ..spec };
+        let mut planes = vec![0; halved.output_len()];
+        halved.plan(8, 12).unwrap().apply(&image, &mut planes);
+        assert_eq!((planes[0], planes[6]), (80, 20));
+    }
+
+    #[test]
     fn stopping_at_the_rgb_stage_changes_nothing() {
         for colour_first in [false, true] {
             for colour in [Colour::Rgb, Colour::Saturation, Colour::Yuv] {
-                for interpolation in [Interpolation::Linear, Interpolation::Area] {
-                    let spec = Preprocessing { colour, colour_first, interpolation, resize: [3, 5], ..small() };
+                for (interpolation, blur) in [(Interpolation::Linear, true), (Interpolation::Area, false)] {
+                    let spec = Preprocessing { colour, colour_first, interpolation, blur, resize: [3, 5], ..small() };
                     let mut preprocessor = spec.plan(8, 12).unwrap();
                     let (mut whole, mut rgb) = (vec![0; spec.output_len()], vec![0; spec.rgb_len()]);
                     preprocessor.apply(&picture(8, 12), &mut whole);
@@ -320,6 +347,7 @@ mod tests {
         .unwrap();
         assert_eq!(spec.output(), [1, 64, 64]);
         assert_eq!((spec.rgb_size(), spec.scale), ([98, 320], 1.0));
+        assert!(!toml::to_string(&spec).unwrap().contains("blur"), "files of models without it stay as they were");
         assert!(toml::from_str::<Preprocessing>("colours = 'rgb'").is_err());
         assert_eq!(toml::from_str::<Preprocessing>("colour = 'yuv-old'").unwrap().colour, Colour::YuvOld);
     }

@@ -86,6 +86,10 @@ pub struct Augmentation {
     /// picture between 0 and this.
     #[serde(skip_serializing_if = "is_zero")]
     pub block_noise: f64,
+    /// Noise of single pixels and channels, which changes from frame to frame: grain, and texture too fine for the picture. Each error is
+    /// drawn up to an amplitude in grey levels, and the amplitude of a picture between 0 and this.
+    #[serde(skip_serializing_if = "is_zero")]
+    pub pixel_noise: f64,
 }
 
 fn is_zero(number: &f64) -> bool {
@@ -109,6 +113,7 @@ impl Default for Augmentation {
             tint: None,
             contrast: None,
             block_noise: 0.0,
+            pixel_noise: 0.0,
         }
     }
 }
@@ -123,6 +128,7 @@ impl Augmentation {
             || self.shift_px > 0.0
             || self.lines > 0
             || self.block_noise > 0.0
+            || self.pixel_noise > 0.0
             || self.changes_colours()
     }
 
@@ -151,8 +157,10 @@ impl Augmentation {
         if self.lines > 100 {
             return wrong("lines", "must be 0 to 100");
         }
-        if !(0.0..=64.0).contains(&self.block_noise) {
-            return wrong("block_noise", "must be 0 to 64 grey levels");
+        for (key, amplitude) in [("block_noise", self.block_noise), ("pixel_noise", self.pixel_noise)] {
+            if !(0.0..=64.0).contains(&amplitude) {
+                return wrong(key, "must be 0 to 64 grey levels");
+            }
         }
         if !(0.0..=180.0).contains(&self.hue_deg) {
             return wrong("hue_deg", "must be 0 to 180");
@@ -242,6 +250,9 @@ impl Augmentation {
             let block = [side(source_rows_per_row), side(preprocessing.source_px_per_rgb_px())];
             block_noise(rgb, width, block, amplitude, rng);
         }
+        if self.pixel_noise > 0.0 {
+            pixel_noise(rgb, uniform(rng, 0.0, self.pixel_noise), rng);
+        }
         moved_px
     }
 }
@@ -269,6 +280,18 @@ fn block_noise(rgb: &mut [u8], width: usize, block: [usize; 2], amplitude: f64, 
                     }
                 }
             }
+        }
+    }
+}
+
+/// Adds an error of up to `amplitude` grey levels to each grey level.
+fn pixel_noise(rgb: &mut [u8], amplitude: f64, rng: &mut impl Rng) {
+    // A random byte for each grey level, [-127, 127] / 127 of the amplitude, which counts in 1/256 of a grey level.
+    let step = (amplitude * 256.0 / 127.0).round() as i32;
+    for greys in rgb.chunks_mut(8) {
+        for (grey, random) in greys.iter_mut().zip(rng.next_u64().to_le_bytes()) {
+            let error = (i32::from(random as i8).max(-127) * step + 128) >> 8;
+            *grey = (i32::from(*grey) + error).clamp(0, 255) as u8;
         }
     }
 }
@@ -510,6 +533,40 @@ mod tests {
         assert!(reaches(|o| o.right_m) > 0.98 && reaches(|o| -o.turn) > 0.1);
         let always: ViewSpec = toml::from_str("offset_m = 1.0\nturn_deg = 6.0").unwrap();
         assert!((0..100).all(|stream| always.draw(&mut rng(3, Purpose::View, 0, stream)).is_some()));
+    }
+
+    #[test]
+    fn pixel_noise_is_fresh_for_each_grey_level_and_has_the_amplitude_that_was_asked_for() {
+        let noise: Augmentation = toml::from_str("pixel_noise = 20").unwrap();
+        let preprocessing = Preprocessing { source: [80, 160], rows: [0, 80], resize: [40, 80], ..Default::default() };
+        let mut widest = 0.0_f64;
+        for stream in 0..50 {
+            let mut rgb = vec![128; 40 * 80 * 3];
+            assert_eq!(noise.apply(&preprocessing, &mut rgb, &mut rng(1, Purpose::Test, 0, stream)), 0.0);
+            let errors: Vec<f64> = rgb.iter().map(|grey| f64::from(*grey) - 128.0).collect();
+            let count = errors.len() as f64;
+            let square = errors.iter().map(|e| e * e).sum::<f64>() / count;
+            let largest = errors.iter().fold(0.0, |a: f64, e| a.max(e.abs()));
+            assert!(largest <= 20.0 && errors.iter().sum::<f64>().abs() / count < 0.5);
+            // Evenly spread errors: the mean square is a third of that of the amplitude. Neighbours in channel, row and column know
+            // nothing of each other.
+            assert!((square / (largest * largest) - 1.0 / 3.0).abs() < 0.1 || largest < 4.0, "{square} {largest}");
+            for apart in [1, 3, 240] {
+                let together = errors.iter().zip(&errors[apart..]).map(|(a, b)| a * b).sum::<f64>() / count;
+                assert!(together.abs() <= 0.06 * square, "{apart}: {together} of {square}");
+            }
+            widest = widest.max(largest);
+        }
+        assert!(widest > 17.0, "{widest}");
+        assert!(
+            Augmentation { pixel_noise: 65.0, ..noise }.validate().unwrap_err().to_string().contains("pixel_noise")
+        );
+        let mut limits = [0u8, 255].repeat(300);
+        pixel_noise(&mut limits, 64.0, &mut rng(1, Purpose::Test, 0, 0));
+        assert!(
+            limits.iter().step_by(2).all(|grey| *grey <= 64)
+                && limits.iter().skip(1).step_by(2).all(|grey| *grey >= 191)
+        );
     }
 
     #[test]

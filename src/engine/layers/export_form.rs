@@ -1,6 +1,6 @@
 //! What layers compute in evaluation, as data for exporters.
 
-use super::Formula;
+use super::{Formula, Taps};
 
 /// A layer of evaluation with its numbers, in one of the elementary operations that every exporter knows.
 ///
@@ -77,6 +77,13 @@ pub enum ExportForm {
         top: usize,
         /// Column of the output that holds the first column of the input.
         left: usize,
+    },
+    /// Each row of the output is a weighted sum of rows of the input, and each column of columns.
+    Resize {
+        /// The rows.
+        rows: Taps,
+        /// The columns.
+        columns: Taps,
     },
     /// The map as a vector, in the order channel, row, column.
     Flatten,

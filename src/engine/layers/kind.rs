@@ -4,7 +4,7 @@ use std::fmt::Debug;
 
 use steersman_kernels::Backend;
 
-use super::{ExportForm, Layer};
+use super::{ExportForm, Layer, ResizeMethod};
 use crate::engine::tensor::Shape;
 
 /// Largest number of filters or units, and largest side of a kernel, window or stride.
@@ -98,6 +98,13 @@ pub enum ReceptiveField {
         /// Output (i, j) sees rows from `i · stride[0] − before[0]` on, columns likewise: rows and columns of padding before
         /// the input if positive, of input cut off if negative.
         before: [isize; 2],
+    },
+    /// The output is the map in another size: output (i, j) sees what the [`Taps`](super::Taps) of its row and of its column say.
+    Resized {
+        /// Height and width of the output.
+        to: [usize; 2],
+        /// How.
+        method: ResizeMethod,
     },
     /// The output is a vector: its positions are not those of the input.
     All,

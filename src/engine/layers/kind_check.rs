@@ -3,7 +3,7 @@
 use steersman_kernels::Isa;
 
 use super::gradcheck::Harness;
-use super::{ExportForm, Family, LayerKind, ReceptiveField};
+use super::{ExportForm, Family, LayerKind, ReceptiveField, Taps};
 use crate::engine::tensor::Shape;
 
 /// Asks `kind` all questions of [`LayerKind`] and checks the answers on inputs of shape `input`.
@@ -26,8 +26,9 @@ pub fn check_kind(kind: &dyn LayerKind, input: Shape) {
         Family::Activation | Family::Normalization | Family::Regularization => {
             kind.receptive_field(input) == ReceptiveField::Element
         }
-        Family::Convolution | Family::Pooling => {
-            matches!(kind.receptive_field(input), ReceptiveField::Window { .. })
+        Family::Convolution => matches!(kind.receptive_field(input), ReceptiveField::Window { .. }),
+        Family::Pooling => {
+            matches!(kind.receptive_field(input), ReceptiveField::Window { .. } | ReceptiveField::Resized { .. })
         }
         Family::Dense => kind.receptive_field(input) == ReceptiveField::All,
         Family::Rearrangement => kind.receptive_field(input) != ReceptiveField::Element,
@@ -87,6 +88,7 @@ pub fn check_kind(kind: &dyn LayerKind, input: Shape) {
         | ExportForm::AveragePool { .. }
         | ExportForm::Crop { .. }
         | ExportForm::ZeroPad { .. }
+        | ExportForm::Resize { .. }
         | ExportForm::Flatten => {}
     }
 }
@@ -96,6 +98,11 @@ fn sees(field: ReceptiveField, input: Shape, output: Shape, i: usize, o: usize) 
     match field {
         ReceptiveField::Element => i == o,
         ReceptiveField::All => true,
+        ReceptiveField::Resized { to, method } => {
+            let (i, o) = (i % input.positions(), o % output.positions());
+            Taps::new(input.h, to[0], method).seen(o / output.w).contains(&(i / input.w))
+                && Taps::new(input.w, to[1], method).seen(o % output.w).contains(&(i % input.w))
+        }
         ReceptiveField::Window { size, stride, before } => {
             let (i, o) = (i % input.positions(), o % output.positions());
             let (from, to) = ([i / input.w, i % input.w], [o / output.w, o % output.w]);

@@ -46,6 +46,7 @@ pub mod gradcheck;
 mod kind;
 mod kind_check;
 mod pool;
+mod resize;
 mod scale;
 mod zero_pad;
 
@@ -68,6 +69,7 @@ pub use formula::{Formula, Function};
 pub use kind::{Family, LayerKind, ReceptiveField};
 pub use kind_check::check_kind;
 pub use pool::{AveragePool, AveragePoolSpec, MaxPool, MaxPoolSpec};
+pub use resize::{Resize, ResizeMethod, ResizeSpec, Taps};
 pub use scale::{Scale, ScaleSpec};
 pub use zero_pad::{ZeroPad, ZeroPadSpec};
 

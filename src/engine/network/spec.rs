@@ -6,8 +6,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::engine::layers::{
     AveragePoolSpec, BatchNormSpec, BlurSpec, Conv2dSpec, CropSpec, DenseSpec, DropoutSpec, EluSpec, FlattenSpec,
-    LayerKind, LeakyReluSpec, MaxPoolSpec, PReluSpec, ReluSpec, ScaleSpec, SoftsignSpec, SwishSpec, TanhSpec,
-    ZeroPadSpec,
+    LayerKind, LeakyReluSpec, MaxPoolSpec, PReluSpec, ReluSpec, ResizeSpec, ScaleSpec, SoftsignSpec, SwishSpec,
+    TanhSpec, ZeroPadSpec,
 };
 
 /// Makes [`LayerSpec`] from lines `"kind in recipes" Variant(Options) "example";`.
@@ -70,6 +70,7 @@ layer_specs! {
     "dense" Dense(DenseSpec) "{ kind = 'dense', units = 3 }";
     "scale" Scale(ScaleSpec) "{ kind = 'scale', factor = 0.5, offset = -1.0 }";
     "crop" Crop(CropSpec) "{ kind = 'crop', rows = [2, 1], columns = [0, 1] }";
+    "resize" Resize(ResizeSpec) "{ kind = 'resize', to = [17, 14], method = 'area' }";
     "zero_pad" ZeroPad(ZeroPadSpec) "{ kind = 'zero_pad', rows = [1, 0], columns = [2, 1] }";
 }
 

@@ -11,7 +11,7 @@ use super::limits::check_size;
 use super::messages::{Problem, shown};
 use super::translate::{AxisOrder, KerasStep, KernelLayout, Operation};
 use crate::engine::layers::{
-    AveragePoolSpec, BatchNormSpec, Conv2dSpec, CropSpec, DenseSpec, FlattenSpec, MaxPoolSpec, PReluSpec, Padding,
+    AveragePoolSpec, BatchNormSpec, Conv2dSpec, DenseSpec, FlattenSpec, MaxPoolSpec, PReluSpec, Padding,
     ReceptiveField, Slopes,
 };
 use crate::engine::network::{LayerSpec, Parameters};
@@ -114,7 +114,12 @@ impl Assembler<'_> {
                 self.pool(*max, [self.shape.h, self.shape.w], [1, 1], false)?;
                 self.is_flat = true;
             }
-            Operation::Shrink { to, linear } => self.shrink(*to, *linear)?,
+            Operation::Resize(spec) => {
+                self.needs_map()?;
+                if spec.to != [self.shape.h, self.shape.w] {
+                    self.push(spec.clone().into(), Vec::new(), Vec::new())?;
+                }
+            }
             Operation::Flatten => self.flatten(step.order)?,
         }
         match &step.activation {
@@ -328,31 +333,6 @@ impl Assembler<'_> {
         let stride = (stride != window).then_some(stride);
         let spec = if max { MaxPoolSpec { window, stride }.into() } else { AveragePoolSpec { window, stride }.into() };
         self.push(spec, Vec::new(), Vec::new())
-    }
-
-    /// A map of an n-th of the height and an m-th of the width. Between two pixel centres lies the mean of both; on one it is that
-    /// pixel, and `nearest` takes the one behind the middle.
-    fn shrink(&mut self, to: [usize; 2], linear: bool) -> Result<(), String> {
-        self.needs_map()?;
-        let Shape { h, w, .. } = self.shape;
-        if to == [h, w] {
-            return Ok(());
-        }
-        if to.contains(&0) || h % to[0] != 0 || w % to[1] != 0 {
-            return Err(format!(
-                "resizes {h}x{w} to {}x{}, which is no whole part of it: resize the image before the network instead, in \
-                 the preprocessing",
-                to[0], to[1]
-            ));
-        }
-        let stride = [h / to[0], w / to[1]];
-        let window = stride.map(|stride| if linear && stride % 2 == 0 { 2 } else { 1 });
-        let first = [0, 1].map(|axis| if linear { (stride[axis] - 1) / 2 } else { stride[axis] / 2 });
-        if first != [0, 0] {
-            let [rows, columns] = first.map(|first| [first, 0]);
-            self.push(CropSpec { rows, columns }.into(), Vec::new(), Vec::new())?;
-        }
-        self.push(AveragePoolSpec { window, stride: Some(stride) }.into(), Vec::new(), Vec::new())
     }
 
     fn flatten(&mut self, order: Option<AxisOrder>) -> Result<(), String> {

@@ -6,8 +6,8 @@ use super::architecture::KerasLayer;
 use super::lambda::{self, LambdaAffine};
 use super::messages::shown;
 use crate::engine::layers::{
-    BatchNormSpec, Conv2dSpec, CropSpec, DropoutSpec, EluSpec, LeakyReluSpec, Padding, ReluSpec, ScaleSpec,
-    SoftsignSpec, SwishSpec, TanhSpec, ZeroPadSpec,
+    BatchNormSpec, Conv2dSpec, CropSpec, DropoutSpec, EluSpec, LeakyReluSpec, Padding, ReluSpec, ResizeMethod,
+    ResizeSpec, ScaleSpec, SoftsignSpec, SwishSpec, TanhSpec, ZeroPadSpec,
 };
 use crate::engine::network::LayerSpec;
 use crate::engine::tensor::Initializer;
@@ -64,11 +64,8 @@ pub(super) enum Operation {
     GlobalPool {
         max: bool,
     },
-    /// Height and width, by picking or averaging pixels.
-    Shrink {
-        to: [usize; 2],
-        linear: bool,
-    },
+    /// A map of another height and width.
+    Resize(ResizeSpec),
     Flatten,
 }
 
@@ -185,14 +182,16 @@ pub(super) fn translate(layer: &KerasLayer, known: Option<LambdaAffine>) -> Resu
                     return Err(format!("`{name}` has no counterpart"));
                 }
             }
-            let linear = match options.find(&["interpolation"]).map_or(Some("bilinear"), |(_, value)| value.as_str()) {
-                Some("bilinear") => true,
-                Some("nearest") => false,
+            let method = match options.find(&["interpolation"]).map_or(Some("bilinear"), |(_, value)| value.as_str()) {
+                Some("bilinear") => ResizeMethod::Bilinear,
+                Some("nearest") => ResizeMethod::Nearest,
+                // Keras 2 alone.
+                Some("area") => ResizeMethod::Area,
                 other => {
                     return Err(format!("interpolation `{}` has no counterpart", shown(other.unwrap_or("unknown"))));
                 }
             };
-            Operation::Shrink { to: [options.size(&["height"])?, options.size(&["width"])?], linear }
+            Operation::Resize(ResizeSpec { to: [options.size(&["height"])?, options.size(&["width"])?], method })
         }
         "Activation" => {
             activation = options.activation()?;

@@ -103,7 +103,8 @@ fn network(graph: &mut GraphBuilder, steps: &[ChainStep], input: &str, outputs: 
             | ExportForm::MaxPool { .. }
             | ExportForm::AveragePool { .. }
             | ExportForm::Crop { .. }
-            | ExportForm::ZeroPad { .. } => Some(true),
+            | ExportForm::ZeroPad { .. }
+            | ExportForm::Resize { .. } => Some(true),
             ExportForm::Dense { .. } | ExportForm::Flatten => Some(false),
             ExportForm::Identity
             | ExportForm::Elementwise(_)
@@ -190,6 +191,23 @@ fn operation(graph: &mut GraphBuilder, step: &ChainStep, x: &str, is_map: bool) 
             let (bottom, right) = (output.h - input.h - top, output.w - input.w - left);
             let pads = graph.int64s(&constant("pads"), &[0, 0, *top, *left, 0, 0, bottom, right]);
             graph.node("Pad", name, &[x, &pads], vec![])
+        }
+        ExportForm::Resize { rows, columns } => {
+            // The weights as matrices: rows · x · columns.
+            let mut down = vec![0.0; output.h * input.h];
+            for i in 0..output.h {
+                let (first, weights) = rows.of(i);
+                down[i * input.h + first..][..weights.len()].copy_from_slice(weights);
+            }
+            let mut across = vec![0.0; input.w * output.w];
+            for j in 0..output.w {
+                let (first, weights) = columns.of(j);
+                weights.iter().enumerate().for_each(|(l, weight)| across[(first + l) * output.w + j] = *weight);
+            }
+            let down = graph.floats(&constant("rows"), &[output.h, input.h], &down);
+            let across = graph.floats(&constant("columns"), &[input.w, output.w], &across);
+            let rows = graph.node("MatMul", &constant("down"), &[&down, x], vec![]);
+            graph.node("MatMul", name, &[&rows, &across], vec![])
         }
         ExportForm::Flatten | ExportForm::Identity => x.into(),
     }

@@ -23,6 +23,26 @@ static uint8_t clamp_level(int32_t x) {
     return (uint8_t)(x < 0 ? 0 : x > 255 ? 255 : x);
 }
 
+/* == blur */
+/* The mean of 3x3 pixels of [h][w][3] with the weights 1, 2, 1 in each direction, rounded half up; mirrored at the border. */
+static void blur(const uint8_t *src, uint8_t *dst, int h, int w) {
+    for (int y = 0; y < h; y++) {
+        int rows[4] = {y > 0 ? y - 1 : h > 1, y, y, y + 1 < h ? y + 1 : y > 0 ? y - 1 : 0};
+        for (int x = 0; x < w; x++) {
+            int columns[4] = {x > 0 ? x - 1 : w > 1, x, x, x + 1 < w ? x + 1 : x > 0 ? x - 1 : 0};
+            for (int c = 0; c < 3; c++) {
+                int sum = 8;
+                for (int i = 0; i < 4; i++) {
+                    for (int j = 0; j < 4; j++) {
+                        sum += src[(rows[i] * w + columns[j]) * 3 + c];
+                    }
+                }
+                *dst++ = (uint8_t)(sum / 16);
+            }
+        }
+    }
+}
+
 /* == resize */
 /* From [from_h][from_w][channels] to [to_h][to_w][channels]. */
 struct resize {
@@ -337,6 +357,34 @@ static void zero_pad(const float *x, float *y, struct pad s) {
         float *out = y + (row / s.h * s.out_h + s.top + row % s.h) * s.out_w + s.left;
         for (int j = 0; j < s.w; j++) {
             out[j] = *x++;
+        }
+    }
+}
+
+/* == resample_map */
+struct resample {
+    int c, h, w, out_h, out_w;
+};
+
+/* Weighted sums of rows and columns of each map. A tap is (first position, first weight, end of the weights). */
+static void resample_map(const float *x, float *y, const int32_t *rows, const float *row_weights, const int32_t *columns,
+                         const float *column_weights, struct resample s) {
+    for (int c = 0; c < s.c; c++) {
+        for (int i = 0; i < s.out_h; i++) {
+            const int32_t *down = rows + 3 * i;
+            for (int j = 0; j < s.out_w; j++) {
+                const int32_t *across = columns + 3 * j;
+                float cell = 0.0f;
+                for (int l = across[1]; l < across[2]; l++) {
+                    int column = across[0] + l - across[1];
+                    float sum = 0.0f;
+                    for (int k = down[1]; k < down[2]; k++) {
+                        sum += row_weights[k] * x[(c * s.h + down[0] + k - down[1]) * s.w + column];
+                    }
+                    cell += column_weights[l] * sum;
+                }
+                *y++ = cell;
+            }
         }
     }
 }

@@ -17,6 +17,24 @@ fn clamp_level(x: i32) -> u8 {
     x.clamp(0, 255) as u8
 }
 
+// == blur
+/// The mean of 3x3 pixels of `[h][w][3]` with the weights 1, 2, 1 in each direction, rounded half up; mirrored at the border.
+fn blur(src: &[u8], dst: &mut [u8], h: usize, w: usize) {
+    let around = |i: usize, n: usize| {
+        [if i > 0 { i - 1 } else { (n > 1) as usize }, i, i, if i + 1 < n { i + 1 } else { i.saturating_sub(1) }]
+    };
+    for (i, out) in dst[..h * w * 3].iter_mut().enumerate() {
+        let (y, x, c) = (i / 3 / w, i / 3 % w, i % 3);
+        let mut sum = 8;
+        for y in around(y, h) {
+            for x in around(x, w) {
+                sum += u16::from(src[(y * w + x) * 3 + c]);
+            }
+        }
+        *out = (sum / 16) as u8;
+    }
+}
+
 // == resize
 /// From `[from_h][from_w][channels]` to `[to_h][to_w][channels]`.
 struct Resize {
@@ -352,6 +370,40 @@ fn zero_pad(x: &[f32], y: &mut [f32], s: Pad) {
     for (row, x) in x.chunks_exact(s.w).enumerate().take(s.c * s.h) {
         let start = (row / s.h * s.out_h + s.top + row % s.h) * s.out_w + s.left;
         y[start..][..s.w].copy_from_slice(x);
+    }
+}
+
+// == resample_map
+struct Resample {
+    c: usize,
+    h: usize,
+    w: usize,
+    out_h: usize,
+    out_w: usize,
+}
+
+/// Weighted sums of rows and columns of each map. A tap is (first position, first weight, end of the weights).
+fn resample_map(
+    x: &[f32],
+    y: &mut [f32],
+    rows: &[i32],
+    row_weights: &[f32],
+    columns: &[i32],
+    column_weights: &[f32],
+    s: Resample,
+) {
+    let places = y[..s.c * s.out_h * s.out_w].iter_mut().enumerate();
+    for (place, out) in places {
+        let (c, i, j) = (place / s.out_w / s.out_h, place / s.out_w % s.out_h, place % s.out_w);
+        let [y, x_tap] = [&rows[3 * i..], &columns[3 * j..]].map(|tap| [tap[0] as usize, tap[1] as usize, tap[2] as usize]);
+        *out = 0.0;
+        for (l, across) in column_weights[x_tap[1]..x_tap[2]].iter().enumerate() {
+            let mut sum = 0.0;
+            for (k, down) in row_weights[y[1]..y[2]].iter().enumerate() {
+                sum += down * x[(c * s.h + y[0] + k) * s.w + x_tap[0] + l];
+            }
+            *out += across * sum;
+        }
     }
 }
 

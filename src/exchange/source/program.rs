@@ -39,9 +39,10 @@ pub enum Values {
     U16(Vec<u16>),
 }
 
-/// A buffer of the model. The first two hold bytes, the others floats.
+/// A buffer of the model. The first three hold bytes, the others floats.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Buffer {
+    Blurred,
     Pixels,
     Planes,
     A,
@@ -51,6 +52,7 @@ pub enum Buffer {
 impl Buffer {
     pub fn name(self) -> &'static str {
         match self {
+            Buffer::Blurred => "blurred",
             Buffer::Pixels => "pixels",
             Buffer::Planes => "planes",
             Buffer::A => "a",
@@ -59,7 +61,7 @@ impl Buffer {
     }
 
     pub fn holds_bytes(self) -> bool {
-        matches!(self, Buffer::Pixels | Buffer::Planes)
+        matches!(self, Buffer::Blurred | Buffer::Pixels | Buffer::Planes)
     }
 }
 
@@ -76,6 +78,7 @@ pub enum Statement {
     Map { comment: String, buffer: Buffer, len: usize, formula: Formula },
 }
 
+#[derive(Clone)]
 pub enum Arg {
     /// Bytes of the camera image.
     Image(Range<usize>),
@@ -211,8 +214,16 @@ impl<'a> Program<'a> {
         let kept = [end - first, width];
         let [channels, h, w] = spec.output();
         let mut at = Arg::Image(first * width * 3..end * width * 3);
+        let mut kept_rows = format!("Rows {first} to {end}");
+        if spec.blur {
+            let comment = Some(format!("{kept_rows}, blurred"));
+            self.reserve(Buffer::Blurred, kept[0] * kept[1] * 3);
+            self.call(comment, "blur", vec![at, Arg::Write(Buffer::Blurred, 0), Arg::Int(kept[0]), Arg::Int(kept[1])]);
+            kept_rows = "The blurred rows".into();
+            at = Arg::Read(Buffer::Blurred, 0);
+        }
         if spec.colour_first {
-            let comment = Some(format!("Rows {first} to {end} in {}", colour_name(spec.colour)));
+            let comment = Some(format!("{kept_rows} in {}", colour_name(spec.colour)));
             self.colour(spec.colour, at, Buffer::Pixels, kept, comment);
             at = Arg::Read(Buffer::Pixels, 0);
             for channel in 0..channels {
@@ -225,9 +236,8 @@ impl<'a> Program<'a> {
                 }
             }
         } else {
-            let comment = Some(format!("Rows {first} to {end}, resized to {h}x{w}"));
-            let src = Arg::Image(first * width * 3..end * width * 3);
-            if self.resize(src, Arg::Write(Buffer::Pixels, 0), kept, 3, comment) {
+            let comment = Some(format!("{kept_rows}, resized to {h}x{w}"));
+            if self.resize(at.clone(), Arg::Write(Buffer::Pixels, 0), kept, 3, comment) {
                 self.reserve(Buffer::Pixels, 3 * h * w);
                 at = Arg::Read(Buffer::Pixels, 0);
             }
@@ -375,6 +385,23 @@ impl<'a> Program<'a> {
                 let mut sizes = map_sizes(*input);
                 sizes.extend([("top", *top), ("left", *left), ("out_h", output.h), ("out_w", output.w)]);
                 self.map_call(step, "zero_pad", vec![Arg::Sizes("pad", sizes)]);
+            }
+            ExportForm::Resize { rows, columns } => {
+                let mut args = Vec::new();
+                for (axis, taps) in [("row", rows), ("column", columns)] {
+                    let (mut ranges, mut all) = (Vec::new(), Vec::new());
+                    for i in 0..taps.outputs() {
+                        let (first, weights) = taps.of(i);
+                        ranges.extend([first as i32, all.len() as i32, (all.len() + weights.len()) as i32]);
+                        all.extend_from_slice(weights);
+                    }
+                    args.push(self.array(array(&format!("{axis}s")), Values::I32(ranges)));
+                    args.push(self.array(array(&format!("{axis}_weights")), Values::F32(all)));
+                }
+                let mut sizes = map_sizes(*input);
+                sizes.extend([("out_h", output.h), ("out_w", output.w)]);
+                args.push(Arg::Sizes("resample", sizes));
+                self.map_call(step, "resample_map", args);
             }
             // A map is laid out as the vector is.
             ExportForm::Flatten | ExportForm::Identity => {}

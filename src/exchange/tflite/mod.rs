@@ -119,7 +119,7 @@ fn preprocessing(graph: &mut Graph, spec: &Preprocessing, image: &str) -> String
         let value = graph.floats(name, &[], &[value as f32]);
         graph.elementwise(code, name, &[x, &value])
     };
-    let is_affine = [end - first, width] == spec.resize && spec.colour == Colour::Rgb;
+    let is_affine = !spec.blur && [end - first, width] == spec.resize && spec.colour == Colour::Rgb;
     let mut scale = spec.scale;
     if is_affine {
         // The division by 255 goes into the scale.

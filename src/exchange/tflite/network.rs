@@ -1,7 +1,7 @@
 //! The network as operators on `[1, h, w, c]` and `[1, c]`, where the engine has `[c][h][w]`.
 
 use super::graph::{Code, Graph, Options};
-use crate::engine::layers::{ExportForm, Formula, Function, Pads};
+use crate::engine::layers::{ExportForm, Formula, Function, Pads, Taps};
 use crate::engine::tensor::Shape;
 use crate::exchange::chain::{ChainStep, ChannelAffine, scale_and_shift};
 
@@ -157,9 +157,36 @@ fn operation(graph: &mut Graph, step: &ChainStep, value: Value, relu: bool) -> V
             let (bottom, right) = (output.h - input.h - top, output.w - input.w - left);
             is_map(graph.pad(name, &x, [*top, *left, bottom, right]))
         }
+        ExportForm::Resize { rows, columns } => {
+            let x = map(graph, name, value);
+            let down = weighted_sum(graph, &constant("rows"), &x, 1, rows);
+            is_map(weighted_sum(graph, name, &down, 2, columns))
+        }
         ExportForm::Flatten => flat(graph, name, value),
         ExportForm::Identity => value,
     }
+}
+
+/// The weighted sums of `taps` along `axis` of a map, in the order of the inputs. Where an output sees fewer than others do, its last
+/// input counts again, with a weight of 0.
+fn weighted_sum(graph: &mut Graph, name: &str, x: &str, axis: usize, taps: &Taps) -> String {
+    let seen: Vec<(usize, &[f32])> = (0..taps.outputs()).map(|i| taps.of(i)).collect();
+    let most = seen.iter().map(|(_, weights)| weights.len()).max().unwrap_or(0);
+    let mut dims = vec![1; 4];
+    dims[axis] = seen.len();
+    let mut sum: Option<String> = None;
+    for k in 0..most {
+        let positions: Vec<usize> = seen.iter().map(|(first, weights)| first + k.min(weights.len() - 1)).collect();
+        let weights: Vec<f32> = seen.iter().map(|(_, weights)| weights.get(k).copied().unwrap_or(0.0)).collect();
+        let inputs = graph.gather_along(&format!("{name}.{k}"), x, axis, &positions);
+        let weights = graph.floats(&format!("{name}.{k}.weights"), &dims, &weights);
+        let product = graph.elementwise(Code::Mul, &format!("{name}.{k}.product"), &[&inputs, &weights]);
+        sum = Some(match sum {
+            Some(sum) => graph.elementwise(Code::Add, name, &[&sum, &product]),
+            None => product,
+        });
+    }
+    sum.expect("every output sees an input")
 }
 
 /// The zeros that TensorFlow puts around the input so that the output has one value for each step: of an odd number more below

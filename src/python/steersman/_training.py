@@ -97,7 +97,7 @@ def train(
 
     Args:
         recordings: one recording or several: folders, logs, or ``.zip`` and ``.tar.gz`` archives of them.
-        recipe: a built-in recipe (``recording``, ``default``, ``lenet``, ``pilotnet``, ``hyper``, ``hyper-prelu``, ``donkey``) or a
+        recipe: a built-in recipe (``recording``, ``default``, ``calm``, ``lenet``, ``pilotnet``, ``hyper``, ``hyper-prelu``, ``donkey``) or a
             recipe file; ``recording`` by default, with ``from_model`` that of the model.
         set: entries of the recipe to change, as in ``{"epochs": 3, "optimizer.learning_rate": 1e-4}``.
         out: run folder, which must not exist or be empty; a new one under ``runs/`` by default.

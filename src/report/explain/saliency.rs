@@ -3,7 +3,7 @@
 //!
 //! The feature maps of each convolution, after its activation, are averaged over the channels; what is negative counts as 0.
 //! From the last map down, each is spread to the size of the layer below by a transposed convolution with the kernel size,
-//! stride and padding of the layer between (weights 1, no bias; pooling likewise) and multiplied with the map there. The map
+//! stride and padding of the layer between (weights 1, no bias; pooling and resizing likewise) and multiplied with the map there. The map
 //! that arrives at the input is scaled to [0, 1].
 //!
 //! It shows what *excites* the layers, not what the steering depends on: that is what [`crate::report::explain::counterfactual`] measures.
@@ -11,7 +11,7 @@
 use ndarray::ArrayView3;
 
 use crate::dataset::preprocess::Preprocessing;
-use crate::engine::layers::{Family, ReceptiveField};
+use crate::engine::layers::{Family, ReceptiveField, Taps};
 use crate::engine::network::Network;
 use crate::error::{Error, Result};
 use crate::picture::RgbImage;
@@ -44,10 +44,12 @@ struct ChannelMean {
 }
 
 /// What is done on the way from the last map to the input, in the order of the layers; gone through backwards.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 enum BackStep {
-    /// Through a layer that changes the size.
+    /// Through a layer with windows.
     Spread([SpreadAxis; 2]),
+    /// Through a layer that resizes.
+    Resize([ResizedAxis; 2]),
     /// Multiply with this mean.
     Multiply(usize),
 }
@@ -65,6 +67,21 @@ pub struct SpreadAxis {
     pub stride: usize,
     /// Inputs before the first that the first output covers: padding if positive, what was cut off if negative.
     pub before: isize,
+}
+
+/// Receptive field along one axis of a layer that resizes `from` inputs.
+#[derive(Clone, Debug)]
+struct ResizedAxis {
+    from: usize,
+    taps: Taps,
+}
+
+/// Which inputs each output of an axis covers.
+trait Coverage {
+    /// Number of inputs and of outputs.
+    fn sizes(&self) -> [usize; 2];
+    /// The inputs that output `i` covers.
+    fn covered(&self, i: usize) -> std::ops::Range<usize>;
 }
 
 impl Saliency {
@@ -101,6 +118,11 @@ impl Saliency {
                         steps.push(BackStep::Multiply(means.len() - 1));
                     }
                 }
+                ReceptiveField::Resized { to, method } => {
+                    let axis = |from, to| ResizedAxis { from, taps: Taps::new(from, to, method) };
+                    steps.push(BackStep::Resize([axis(input.h, to[0]), axis(input.w, to[1])]));
+                    after_convolution = false;
+                }
                 // The map counts as it leaves the activation.
                 ReceptiveField::Element => {
                     if let Some(mean) = means.last_mut().filter(|_| after_convolution) {
@@ -117,7 +139,8 @@ impl Saliency {
         steps.truncate(last + 1);
         let input = network.input();
         let sides = steps.iter().filter_map(|step| match step {
-            BackStep::Spread([down, across]) => Some(down.from.max(down.to) * across.from.max(across.to)),
+            BackStep::Spread([down, across]) => Some(most_values(down, across)),
+            BackStep::Resize([down, across]) => Some(most_values(down, across)),
             BackStep::Multiply(_) => None,
         });
         let largest = sides.max().unwrap_or(0).max(input.positions());
@@ -169,7 +192,11 @@ impl Saliency {
                     }
                 }
                 BackStep::Spread([down, across]) => {
-                    spread(&self.map, *down, *across, &mut self.half_spread, &mut self.spread);
+                    spread(&self.map, down, across, &mut self.half_spread, &mut self.spread);
+                    std::mem::swap(&mut self.map, &mut self.spread);
+                }
+                BackStep::Resize([down, across]) => {
+                    spread(&self.map, down, across, &mut self.half_spread, &mut self.spread);
                     std::mem::swap(&mut self.map, &mut self.spread);
                 }
             }
@@ -223,31 +250,51 @@ impl ChannelMean {
     }
 }
 
-/// Transposed convolution of `map` with ones: `out[i * stride - before + k] += map[i]` for `k` below the kernel size, first
-/// down into `half`, then across into `out`.
-fn spread(map: &[f32], down: SpreadAxis, across: SpreadAxis, half: &mut Vec<f32>, out: &mut Vec<f32>) {
+/// The most values of a map on the way through both axes.
+fn most_values(down: &impl Coverage, across: &impl Coverage) -> usize {
+    let most = |[from, to]: [usize; 2]| from.max(to);
+    most(down.sizes()) * most(across.sizes())
+}
+
+/// Transposed convolution of `map` with ones: each output is added to the inputs that it covers, first down into `half`, then
+/// across into `out`.
+fn spread(map: &[f32], down: &impl Coverage, across: &impl Coverage, half: &mut Vec<f32>, out: &mut Vec<f32>) {
+    let ([from_h, to_h], [from_w, to_w]) = (down.sizes(), across.sizes());
     half.clear();
-    half.resize(down.from * across.to, 0.0);
-    for i in 0..down.to {
+    half.resize(from_h * to_w, 0.0);
+    for i in 0..to_h {
         for target in down.covered(i) {
-            let (row, below) = (&map[i * across.to..][..across.to], &mut half[target * across.to..][..across.to]);
+            let (row, below) = (&map[i * to_w..][..to_w], &mut half[target * to_w..][..to_w]);
             below.iter_mut().zip(row).for_each(|(sum, value)| *sum += value);
         }
     }
     out.clear();
-    out.resize(down.from * across.from, 0.0);
-    for row in 0..down.from {
-        let below = &mut out[row * across.from..][..across.from];
-        for j in 0..across.to {
-            let value = half[row * across.to + j];
+    out.resize(from_h * from_w, 0.0);
+    for row in 0..from_h {
+        let below = &mut out[row * from_w..][..from_w];
+        for j in 0..to_w {
+            let value = half[row * to_w + j];
             across.covered(j).for_each(|target| below[target] += value);
         }
     }
 }
 
-impl SpreadAxis {
-    /// The inputs that output `i` covers.
-    fn covered(self, i: usize) -> std::ops::Range<usize> {
+impl Coverage for ResizedAxis {
+    fn sizes(&self) -> [usize; 2] {
+        [self.from, self.taps.outputs()]
+    }
+
+    fn covered(&self, i: usize) -> std::ops::Range<usize> {
+        self.taps.seen(i)
+    }
+}
+
+impl Coverage for SpreadAxis {
+    fn sizes(&self) -> [usize; 2] {
+        [self.from, self.to]
+    }
+
+    fn covered(&self, i: usize) -> std::ops::Range<usize> {
         let begin = (i * self.stride) as isize - self.before;
         let inside = |at: isize| at.clamp(0, self.from as isize) as usize;
         inside(begin)..inside(begin + self.kernel as isize)
@@ -259,6 +306,7 @@ mod tests {
     use ndarray::Array3;
 
     use super::*;
+    use crate::engine::layers::ResizeMethod;
     use crate::model_file::{Model, TrainingRecord};
     use crate::recipe::{Recipe, SHIPPED};
     use steersman_kernels::Isa;
@@ -295,9 +343,20 @@ mod tests {
         ] {
             let map: Vec<f32> = (0..down.to * across.to).map(|i| ((i * 37 + 11) % 17) as f32).collect();
             let (mut half, mut out) = (Vec::new(), Vec::new());
-            spread(&map, down, across, &mut half, &mut out);
+            spread(&map, &down, &across, &mut half, &mut out);
             assert_eq!(out, spread_directly(&map, down, across), "{down:?} {across:?}");
         }
+    }
+
+    #[test]
+    fn a_resized_map_spreads_to_what_it_was_made_of() {
+        let axis = |from, to, method| ResizedAxis { from, taps: Taps::new(from, to, method) };
+        let (mut half, mut out) = (Vec::new(), Vec::new());
+        // Rows 0 and 1, 2, 3 and 4 of five; columns 0 and 3 of five.
+        let (down, across) = (axis(5, 3, ResizeMethod::Bilinear), axis(5, 2, ResizeMethod::Nearest));
+        spread(&[1.0, 2.0, 3.0, 4.0, 5.0, 6.0], &down, &across, &mut half, &mut out);
+        let row = |left: f32, right: f32| [0.0, left, 0.0, right, 0.0];
+        assert_eq!(out, [row(1.0, 2.0), row(1.0, 2.0), row(3.0, 4.0), row(5.0, 6.0), row(5.0, 6.0)].concat());
     }
 
     fn pilot(name: &str) -> Pilot {

@@ -19,8 +19,8 @@ pub fn pursuit(simulation: &Simulation) -> f64 {
     pursue(simulation, LOOK_AHEAD_M + LOOK_AHEAD_S * simulation.car.speed_mps)
 }
 
-/// Steering towards the point of the line `ahead` m from the rear axle.
-fn pursue(simulation: &Simulation, ahead: f64) -> f64 {
+/// The steering, [-1, 1], towards the point of the reference line `ahead` m from the rear axle, as [`pursuit`].
+pub fn pursue(simulation: &Simulation, ahead: f64) -> f64 {
     let (track, car) = (simulation.track, &simulation.car);
     let sign = if simulation.reverse { -1.0 } else { 1.0 };
     let target = track.at(simulation.location.s_m + sign * (ahead - REAR_AXLE_M));

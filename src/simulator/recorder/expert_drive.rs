@@ -26,7 +26,7 @@ struct ExpertDrive<'a> {
 }
 
 impl ExpertDrive<'_> {
-    /// Drives one step; returns the label and the throttle that were in force.
+    /// Drives one step; returns the label and the throttle of its beginning.
     fn step(&mut self) -> (f64, f64) {
         let steering = match &mut self.keyboard {
             Some(keyboard) => keyboard.steer(&self.simulation),
@@ -34,9 +34,10 @@ impl ExpertDrive<'_> {
         };
         let target_mph = self.options.target_mph(&self.simulation);
         let throttle = self.speed.throttle(target_mph, self.simulation.car.speed_mps / MPS_PER_MPH, STEP_S);
+        let label = self.options.label(&self.simulation).unwrap_or(steering);
         let disturbed = steering + self.noise.next(STEP_S);
         self.simulation.step(Controls { steering: disturbed, throttle });
-        (steering, throttle)
+        (label, throttle)
     }
 
     fn sample(&self, time_s: f64, (steering, throttle): (f64, f64), body: BodyPose, speed_mps: f64) -> Sample {
@@ -151,7 +152,7 @@ pub fn drive_and_label(
         if step % STEPS_PER_S == 0 {
             by_expert = rng.unit() < expert_share;
         }
-        let label = pursuit(&simulation);
+        let expert = pursuit(&simulation);
         let speed_mph = simulation.car.speed_mps / MPS_PER_MPH;
         let throttle = controller.throttle(options.target_mph(&simulation), speed_mph, STEP_S);
         if step * DRIVE_HZ >= frames * STEPS_PER_S {
@@ -164,13 +165,13 @@ pub fn drive_and_label(
             samples.push(Sample {
                 time_s: simulation.time_s(),
                 body: simulation.body_pose(),
-                steering: label,
+                steering: options.label(&simulation).unwrap_or(expert),
                 throttle: throttle.max(0.0),
                 brake: (-throttle).max(0.0),
                 speed_mph,
             });
         }
-        simulation.step(Controls { steering: if by_expert { label } else { answer }, throttle });
+        simulation.step(Controls { steering: if by_expert { expert } else { answer }, throttle });
         if simulation.cte_m().abs() > LOST_M || simulation.at_wall {
             simulation.put_back();
         }
@@ -236,6 +237,27 @@ mod tests {
         let helped = drive_and_label(&track, &options, &mut Zero, 0.5).unwrap();
         assert!(strength(&zero) > 2.0 * strength(&plain), "{} {}", strength(&zero), strength(&plain));
         assert!(strength(&helped) < strength(&zero));
+    }
+
+    #[test]
+    fn labels_from_farther_ahead_ask_less_for_the_same_place_and_leave_the_drive_as_it_is() {
+        use crate::simulator::trial::driver::Zero;
+        let track = Track::load("lake").unwrap();
+        let own = RecordOptions { recovery: true, laps: 0.2, ..Default::default() };
+        let ahead = RecordOptions { label_ahead_m: Some(12.26), ..own.clone() };
+        let (own_rows, rows) = (drive_expert(&track, &own), drive_expert(&track, &ahead));
+        assert!(own_rows.len() > 50 && own_rows.len() == rows.len());
+        assert!(own_rows.iter().zip(&rows).all(|(a, b)| a.body == b.body && a.throttle == b.throttle));
+        // At 20 mph the expert looks 6.13 m ahead. Right after the car is put beside the line, twice as far asks for a quarter of the way back.
+        let strength = |rows: &[Sample]| rows.iter().map(|s| s.steering.abs()).sum::<f64>();
+        let share = strength(&rows) / strength(&own_rows);
+        assert!((0.25..0.6).contains(&share), "{share}");
+        let same = RecordOptions { recovery: false, label_ahead_m: Some(12.26), ..own };
+        let labelled = drive_and_label(&track, &same, &mut Zero, 0.0).unwrap();
+        let plain = drive_and_label(&track, &RecordOptions { label_ahead_m: None, ..same }, &mut Zero, 0.0).unwrap();
+        assert!(labelled.len() == plain.len() && strength(&labelled) < 0.8 * strength(&plain));
+        let wrong = RecordOptions { label_ahead_m: Some(2.0), ..Default::default() };
+        assert!(wrong.check().unwrap_err().to_string().contains("3 to 30 m"));
     }
 
     #[test]

@@ -8,7 +8,7 @@ use serde::Serialize;
 use crate::geometry::CarGeometry;
 use crate::simulator::camera::foreign_car;
 use crate::simulator::car::dynamics::STEPS_PER_S;
-use crate::simulator::car::expert::Style;
+use crate::simulator::car::expert::{Style, pursue};
 use crate::simulator::car::simulation::Simulation;
 use crate::simulator::car::speed::before_bends_mph;
 use crate::simulator::track::Track;
@@ -44,6 +44,9 @@ pub struct RecordOptions {
     pub speed_mph: f64,
     /// Drive slower than that before and in bends, so that the car is pushed sideways by at most this, m/s².
     pub bends_mps2: Option<f64>,
+    /// The labels are the steering towards the point of the line this far ahead of the rear axle, m, and not the expert's own,
+    /// which drives. From farther away a place beside the line asks for less steering, in proportion to 1 / distance².
+    pub label_ahead_m: Option<f64>,
     /// Strength of a disturbance of the steering that the labels do not show: standard deviation of the steering.
     pub noise: f64,
     /// Rows of the log for each second: 1, 2, 5, 10, 25 or 50.
@@ -63,6 +66,11 @@ impl RecordOptions {
         }
     }
 
+    /// The label at this moment where it is not the expert's own steering.
+    pub(super) fn label(&self, simulation: &Simulation) -> Option<f64> {
+        self.label_ahead_m.map(|ahead_m| pursue(simulation, ahead_m))
+    }
+
     /// Checks the options that hold for every driver: speed and rows per second.
     ///
     /// # Errors
@@ -74,6 +82,10 @@ impl RecordOptions {
         if self.bends_mps2.is_some_and(|mps2| !(0.5..=8.0).contains(&mps2)) {
             let mps2 = self.bends_mps2.unwrap_or_default();
             return Err(Error::Usage(format!("{mps2} m/s² in bends: 0.5 to 8 can be recorded")));
+        }
+        if self.label_ahead_m.is_some_and(|ahead_m| !(3.0..=30.0).contains(&ahead_m)) {
+            let ahead_m = self.label_ahead_m.unwrap_or_default();
+            return Err(Error::Usage(format!("labels that look {ahead_m} m ahead: 3 to 30 m can be recorded")));
         }
         if self.hz == 0 || !STEPS_PER_S.is_multiple_of(self.hz) {
             return Err(Error::Usage(format!("{} rows a second: 1, 2, 5, 10, 25 or 50 can be recorded", self.hz)));
@@ -95,6 +107,7 @@ impl Default for RecordOptions {
             seed: 1,
             speed_mph: 20.0,
             bends_mps2: None,
+            label_ahead_m: None,
             noise: 0.0,
             hz: RECORD_HZ,
             format: LogFormat::Sample,
@@ -125,6 +138,9 @@ pub struct RecordingInfo {
     /// Driven slower than that before and in bends, so that the car was pushed sideways by at most this, m/s².
     #[serde(skip_serializing_if = "Option::is_none")]
     pub bends_mps2: Option<f64>,
+    /// The labels are the steering towards the point of the line this far ahead, m, and not what was driven.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub label_ahead_m: Option<f64>,
     /// Disturbance of the steering.
     pub noise: f64,
     /// Rows for each second.
@@ -146,6 +162,7 @@ impl RecordingInfo {
             style: if options.style == Style::Keyboard { "keyboard" } else { "smooth" }.to_string(),
             speed_mph: options.speed_mph,
             bends_mps2: options.bends_mps2,
+            label_ahead_m: options.label_ahead_m,
             noise: options.noise,
             hz: options.hz,
             rows,

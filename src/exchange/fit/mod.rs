@@ -1,71 +1,57 @@
-//! Finds the preprocessing that a network was trained with: under the right one, its predictions on a recording correlate
-//! with the labels.
+//! Finds the preprocessing that a network was trained with: under the right one, its predictions on a recording go with the labels.
 //!
 //! The first round tries every colour space, crop and scaling on a few frames. The second round tries the best of these on
-//! more frames, and with the other resize methods. Both prefer frames of bends: on a straight road all combinations give
+//! more frames, and with a blur and the other resize methods. Both prefer frames of bends: on a straight road all combinations give
 //! nearly the same prediction.
+//!
+//! They are ranked by the error that is left after the best gain and bias ([`Line`]). So the right preprocessing is also found for a
+//! network that gives degrees, or steers to the other side; gain and correlation tell which.
+
+mod agreement;
+mod candidates;
 
 use std::path::Path;
 
 use ndarray::{ArrayView4, ArrayViewMut1};
 use rayon::prelude::*;
 
-use crate::dataset::colour::Colour;
+pub use self::agreement::{Agreement, Line};
+pub use self::candidates::combinations;
 use crate::dataset::preprocess::Preprocessing;
-use crate::dataset::resize::Interpolation;
 use crate::dataset::{Recording, View};
-use crate::engine::layers::Family;
 use crate::engine::network::{InferencePlan, Network, Parameters};
-use crate::engine::tensor::Shape;
 use crate::error::{Error, Result};
-use crate::metrics::correlation;
 use crate::picture::RgbImage;
-
-/// Rows of Udacity's picture that well-known projects keep: first and end.
-const CROPS: [[usize; 2]; 12] = [
-    [0, 160],
-    [30, 135],
-    [32, 135],
-    [40, 135],
-    [40, 138],
-    [50, 135],
-    [50, 140],
-    [56, 144],
-    [60, 135],
-    [60, 140],
-    [63, 136],
-    [70, 135],
-];
-
-/// Factor and offset that turn a grey level into an input value.
-const SCALINGS: [(f64, f64); 4] = [(1.0, 0.0), (1.0 / 255.0, 0.0), (1.0 / 255.0, -0.5), (1.0 / 127.5, -1.0)];
-
-const COLOURS: [Colour; 7] =
-    [Colour::Rgb, Colour::Bgr, Colour::Yuv, Colour::YuvOld, Colour::Hsv, Colour::Hls, Colour::Lab];
-
-const SINGLE_PLANES: [Colour; 2] = [Colour::Gray, Colour::Saturation];
 
 /// Number of frames in the first and in the second round.
 const FRAMES: [usize; 2] = [96, 480];
 
-/// Number of combinations in the second round.
+/// Number of combinations in the second round, without the variants of the best.
 const FINALISTS: usize = 12;
+
+/// Number of combinations of which variants are tried.
+const VARIED: usize = 3;
 
 /// Steering from which a frame counts as a bend: one degree of 25.
 const TURNED: f32 = 0.04;
 
-/// A preprocessing, and the correlation of the network's predictions with the labels under it.
+/// Pixels of a picture that is kept in memory as it is.
+const MAX_PIXELS: usize = 240 * 320;
+
+/// A preprocessing, and how the network's outputs go with the labels under it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Candidate {
     /// The preprocessing.
     pub preprocessing: Preprocessing,
-    /// Pearson's correlation of predictions and labels; absent if the predictions are all the same.
-    pub correlation: Option<f64>,
+    /// How outputs and labels agree.
+    pub agreement: Agreement,
 }
 
 /// Frames with their labels.
 #[derive(Debug)]
 pub struct Frames {
+    /// Height and width of the images.
+    source: [usize; 2],
     images: Vec<RgbImage>,
     labels: Vec<f32>,
 }
@@ -84,14 +70,18 @@ impl Frames {
         let straight = spread(rows().filter(|row| !is_turned(row)).collect(), FRAMES[1] - FRAMES[1] * 2 / 3);
         let mut chosen = [turned, straight].concat();
         chosen.sort_unstable();
+        // The size of most pictures, unless it would fill the memory; others are scaled to it.
+        let source = match recording.image_size {
+            Some([height, width]) if height * width <= MAX_PIXELS => [height, width],
+            _ => Preprocessing::default().source,
+        };
+        let whole = Preprocessing { source, rows: [0, source[0]], resize: source, ..Preprocessing::default() };
         let read = |row: usize| -> Option<(RgbImage, f32)> {
             let mut image = recording.picture(row, View::Centre)?;
-            // All combinations begin by scaling the image to this size; so much of it is kept in memory.
-            let whole = Preprocessing::default();
-            if [image.height, image.width] != whole.source {
+            if [image.height, image.width] != source {
                 let mut scaled = vec![0; whole.rgb_len()];
                 whole.plan(image.height, image.width).ok()?.to_rgb_stage(&image.pixels, &mut scaled);
-                image = RgbImage { height: whole.source[0], width: whole.source[1], pixels: scaled };
+                image = RgbImage { height: source[0], width: source[1], pixels: scaled };
             }
             Some((image, recording.rows[row].steering))
         };
@@ -100,12 +90,17 @@ impl Frames {
             let message = format!("{} frames could be read, all with the same steering: nothing to fit", labels.len());
             return Err(Error::data(recording.path.as_path(), message));
         }
-        Ok(Frames { images, labels })
+        Ok(Frames { source, images, labels })
     }
 
     /// Number of frames.
     pub fn len(&self) -> usize {
         self.labels.len()
+    }
+
+    /// Height and width of the images: the size that [`combinations`] starts from.
+    pub fn source(&self) -> [usize; 2] {
+        self.source
     }
 
     /// Whether there is no frame.
@@ -120,37 +115,6 @@ fn spread(rows: Vec<usize>, count: usize) -> Vec<usize> {
     (0..count).map(|i| rows[i * rows.len() / count]).collect()
 }
 
-/// The combinations for a network: those of its input's size and number of planes.
-pub fn combinations(network: &Network) -> Vec<Preprocessing> {
-    let Shape { c, h, w } = network.input();
-    let colours: &[Colour] = match c {
-        3 => &COLOURS,
-        1 => &SINGLE_PLANES,
-        _ => &[],
-    };
-    // A network that scales by itself wants grey levels.
-    let first = network.layers().iter().find(|layer| layer.spec.family() != Family::Rearrangement);
-    let scales_itself = first.is_some_and(|layer| layer.spec.family() == Family::Normalization);
-    let scalings = if scales_itself { &SCALINGS[..1] } else { &SCALINGS[..] };
-    let mut all = Vec::new();
-    for colour in colours {
-        for rows in CROPS {
-            for (scale, offset) in scalings {
-                let (scale, offset) = (*scale, *offset);
-                all.push(Preprocessing {
-                    rows,
-                    resize: [h, w],
-                    colour: *colour,
-                    scale,
-                    offset,
-                    ..Preprocessing::default()
-                });
-            }
-        }
-    }
-    all
-}
-
 /// Tries all combinations for the network and ranks the best, best first; `known` is ranked among them.
 ///
 /// # Errors
@@ -162,43 +126,38 @@ pub fn rank(
     frames: &Frames,
     known: Option<&Preprocessing>,
 ) -> Result<Vec<Candidate>> {
-    let combinations = combinations(network);
+    let combinations = combinations(network, frames.source);
     if combinations.is_empty() {
         let c = network.input().c;
         return Err(Error::Usage(format!("no colour space has {c} planes: the preprocessing cannot be guessed")));
     }
     let judge = |all: Vec<Preprocessing>, frames_count: usize| -> Result<Vec<Candidate>> {
         let judged = all.into_par_iter().map(|preprocessing| {
-            let correlation = judge(network, parameters, frames, frames_count, &preprocessing)?;
-            Ok(Candidate { preprocessing, correlation })
+            let agreement = judge(network, parameters, frames, frames_count, &preprocessing)?;
+            Ok(Candidate { preprocessing, agreement })
         });
         let mut judged = judged.collect::<Result<Vec<_>>>()?;
-        let value = |candidate: &Candidate| candidate.correlation.unwrap_or(f64::NEG_INFINITY);
-        judged.sort_by(|a, b| value(b).total_cmp(&value(a)));
+        let error = |candidate: &Candidate| candidate.agreement.line.map_or(f64::INFINITY, |line| line.error);
+        judged.sort_by(|a, b| error(a).total_cmp(&error(b)));
         Ok(judged)
     };
-    let mut finalists: Vec<Preprocessing> =
-        judge(combinations, FRAMES[0])?.into_iter().take(FINALISTS).map(|candidate| candidate.preprocessing).collect();
-    let best_two: Vec<Preprocessing> = finalists.iter().take(2).cloned().collect();
-    for best in best_two {
-        finalists.push(Preprocessing { interpolation: Interpolation::Area, ..best.clone() });
-        if !matches!(best.colour, Colour::Rgb | Colour::Bgr) {
-            finalists.push(Preprocessing { interpolation: Interpolation::Area, colour_first: true, ..best });
-        }
-    }
+    let first = judge(combinations, FRAMES[0])?.into_iter().take(FINALISTS);
+    let mut finalists: Vec<Preprocessing> = first.map(|candidate| candidate.preprocessing).collect();
+    let varied = finalists.len().min(VARIED);
+    finalists.extend(finalists[..varied].iter().flat_map(candidates::variants).collect::<Vec<_>>());
     finalists.extend(known.filter(|known| !finalists.contains(known)).cloned());
     judge(finalists, FRAMES[1])
 }
 
-/// Correlation of predictions and labels under `preprocessing`, over about `count` frames.
+/// How outputs and labels agree under `preprocessing`, over about `count` frames.
 fn judge(
     network: &Network,
     parameters: &Parameters,
     frames: &Frames,
     count: usize,
     preprocessing: &Preprocessing,
-) -> Result<Option<f64>> {
-    let [height, width] = preprocessing.source;
+) -> Result<Agreement> {
+    let [height, width] = frames.source;
     let mut preprocessor = preprocessing.plan(height, width)?;
     let mut plan = InferencePlan::new(network, 1);
     let mut planes = vec![0; preprocessing.output_len()];
@@ -212,7 +171,7 @@ fn judge(
         plan.run(network, parameters, x, ArrayViewMut1::from(&mut outputs));
         pairs.push((f64::from(outputs[0]), f64::from(frames.labels[index])));
     }
-    Ok(correlation(pairs.into_iter()))
+    Ok(Agreement::of(&pairs))
 }
 
 /// The table as it goes into a TOML file.
@@ -227,6 +186,9 @@ pub fn to_toml(place: &Path, preprocessing: &Preprocessing) -> Result<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::dataset::colour::Colour;
+    use crate::engine::layers::{DenseSpec, ScaleSpec};
+    use crate::engine::tensor::Shape;
     use steersman_kernels::Isa;
 
     #[test]
@@ -237,11 +199,10 @@ mod tests {
     }
 
     /// A network that looks for one colour: the mean of the first plane of the input, right half minus left half.
-    #[test]
-    fn the_colour_space_that_the_labels_follow_wins() {
+    fn blue_seeker() -> (Network, Parameters) {
         let layers = [
-            crate::engine::layers::ScaleSpec { factor: 1.0 / 255.0, offset: 0.0 }.into(),
-            crate::engine::layers::DenseSpec { units: 1, init: Default::default() }.into(),
+            ScaleSpec { factor: 1.0 / 255.0, offset: 0.0 }.into(),
+            DenseSpec { units: 1, init: Default::default() }.into(),
         ];
         let network = Network::new(Shape::new(3, 4, 8), &layers, Isa::PORTABLE).unwrap();
         let mut parameters = network.initialize(1);
@@ -249,7 +210,11 @@ mod tests {
         for i in 0..32 {
             parameters.values[i] = if i % 8 < 4 { -0.1 } else { 0.1 };
         }
-        // The label is how blue one side is; red stands anywhere.
+        (network, parameters)
+    }
+
+    /// The label is how blue one side is; red stands anywhere.
+    fn blue_frames() -> Frames {
         let (mut images, mut labels) = (Vec::new(), Vec::new());
         for i in 0..60u8 {
             let (blue, red) = (i % 2 == 0, (i / 2) % 2 == 0);
@@ -260,9 +225,63 @@ mod tests {
             images.push(RgbImage { height: 160, width: 320, pixels });
             labels.push(f32::from(level) / 400.0 * if blue { 1.0 } else { -1.0 });
         }
-        let ranking = rank(&network, &parameters, &Frames { images, labels }, None).unwrap();
+        Frames { source: [160, 320], images, labels }
+    }
+
+    #[test]
+    fn the_colour_space_that_the_labels_follow_wins() {
+        let (network, parameters) = blue_seeker();
+        let ranking = rank(&network, &parameters, &blue_frames(), None).unwrap();
         assert_eq!(ranking[0].preprocessing.colour, Colour::Bgr);
-        assert!(ranking[0].correlation.unwrap() > 0.95);
-        assert_eq!(combinations(&network).len(), COLOURS.len() * CROPS.len(), "it scales by itself");
+        assert!(ranking[0].agreement.correlation.unwrap() > 0.95);
+        assert!(ranking.iter().any(|candidate| candidate.preprocessing.blur));
+        let errors: Vec<f64> = ranking.iter().filter_map(|found| Some(found.agreement.line?.error)).collect();
+        assert!(errors.is_sorted() && errors[0] < 0.1 * errors[errors.len() - 1], "{errors:?}");
+    }
+
+    /// By correlation alone the right colours of a mirrored network are the last of all.
+    #[test]
+    fn a_mirrored_network_in_degrees_is_recognised() {
+        let (network, mut parameters) = blue_seeker();
+        parameters.values.iter_mut().for_each(|weight| *weight *= -45.0);
+        parameters.values[96] = 90.0;
+        let ranking = rank(&network, &parameters, &blue_frames(), None).unwrap();
+        let best = &ranking[0];
+        assert_eq!(best.preprocessing.colour, Colour::Bgr);
+        assert!(best.agreement.correlation.unwrap() < -0.95);
+        assert!(best.agreement.absurdity().unwrap().contains("lie beyond 2"));
+        let [straight, span] = best.agreement.line.unwrap().output_scale([0.0, 1.0]);
+        assert!((straight - 90.0).abs() < 1.0 && span < 0.0, "{straight}, {span}");
+    }
+
+    #[test]
+    fn a_broken_network_is_ranked_and_not_recommended() {
+        let (network, mut parameters) = blue_seeker();
+        parameters.values[96] = f32::NAN;
+        let ranking = rank(&network, &parameters, &blue_frames(), None).unwrap();
+        assert!(ranking.iter().all(|candidate| candidate.agreement.line.is_none()));
+        assert!(ranking[0].agreement.absurdity().unwrap().contains("60 of 60 outputs are infinite or no number"));
+    }
+
+    #[test]
+    fn small_pictures_keep_their_size_and_large_ones_do_not() {
+        let frames = |height: usize, width: usize| {
+            let folder = tempfile::tempdir().unwrap();
+            let mut log = String::from("center,left,right,steering,throttle,brake,speed\n");
+            for row in 0..4u8 {
+                let name = format!("center_2026_01_01_00_00_0{row}_000.png");
+                let level = image::Rgb([50 * row; 3]);
+                image::RgbImage::from_pixel(width as u32, height as u32, level)
+                    .save(folder.path().join(&name))
+                    .unwrap();
+                log += &format!("{name},,,{},0,0,9\n", f32::from(row) / 10.0);
+            }
+            std::fs::write(folder.path().join("driving_log.csv"), log).unwrap();
+            Frames::of(&crate::dataset::load(folder.path()).unwrap()).unwrap()
+        };
+        let small = frames(120, 160);
+        assert_eq!((small.len(), small.source(), small.images[3].pixels.len()), (4, [120, 160], 120 * 160 * 3));
+        assert_eq!((small.images[3].pixels[777], small.labels[3]), (150, 0.3));
+        assert_eq!(frames(480, 640).source(), [160, 320]);
     }
 }
