@@ -4,14 +4,18 @@ mod common;
 
 use std::path::Path;
 use std::sync::Mutex;
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 use common::command::{error, json, run, steersman};
 use common::mp4;
 use common::page::{Page, serve};
+use steersman::Error;
 use steersman::dataset::{self, DrivenSessions};
 use steersman::geometry::{CarGeometry, LookAhead};
 use steersman::picture::RgbImage;
-use steersman::replay::{ReplayLog, ReplayOptions, ReplayRun, replay, side_camera_check, summarise};
+use steersman::replay::{
+    ReplayFrame, ReplayLog, ReplayOptions, ReplayRun, replay, replay_as_far, side_camera_check, summarise,
+};
 
 /// A quarter of a lap of `lake` by the expert, with keys.
 fn record(dir: &Path) {
@@ -23,7 +27,7 @@ fn drive(log: &ReplayLog, latency_ms: f64, steer: impl Fn(f64) -> f32 + Sync) ->
     let options = ReplayOptions { latency_ms, ..ReplayOptions::usual(&log.geometry) };
     let pursuit = Mutex::new(0.0);
     let driver = || Ok(|_: &RgbImage| Ok(steer(*pursuit.lock().unwrap())));
-    let seen = |_: usize, frame: &steersman::replay::ReplayFrame| {
+    let seen = |_: usize, frame: &ReplayFrame| {
         *pursuit.lock().unwrap() = frame.moment.pursuit.unwrap_or(0.0);
         Ok(())
     };
@@ -242,4 +246,50 @@ fn a_drive_on_a_recording_is_filmed_and_watched() {
     }
     assert!(last.number("time_s") > first.number("time_s") && last.number("laps") <= 1.0);
     assert!(last.number("x").hypot(last.number("y")) > 20.0, "the car has made way: {}", last.state);
+}
+
+#[test]
+fn a_drive_that_is_interrupted_gives_what_was_driven() {
+    let scratch = tempfile::tempdir().unwrap();
+    record(scratch.path());
+    let recording = dataset::load(&scratch.path().join("drive")).unwrap();
+    let log = ReplayLog::new(&recording, CarGeometry::preset("steersman").unwrap()).unwrap();
+    let options = ReplayOptions::usual(&log.geometry);
+    let until = |frames: usize| {
+        let shown = AtomicUsize::new(0);
+        let seen = move |_: usize, _: &ReplayFrame| match shown.fetch_add(1, Ordering::Relaxed) < frames {
+            true => Ok(()),
+            false => Err(Error::Interrupted),
+        };
+        (|| Ok(|_: &RgbImage| Ok(0.0)), seen)
+    };
+    let whole = drive(&log, 0.0, |_| 0.0);
+    let (driver, seen) = until(40);
+    let (runs, stopped) = replay_as_far(&log, &options, driver, &seen).unwrap();
+    assert!(stopped && runs[0].moments[..] == whole[0].moments[..40], "{}", runs[0].moments.len());
+    assert!((runs[0].time_s - 2.0).abs() < 1e-9 && (1.0..40.0).contains(&runs[0].distance_m), "{:?}", runs[0].time_s);
+    let (driver, seen) = until(usize::MAX);
+    assert_eq!(replay_as_far(&log, &options, driver, &seen).unwrap(), (whole, false));
+    let (driver, seen) = until(0);
+    assert!(matches!(replay_as_far(&log, &options, driver, &seen), Err(Error::Interrupted)));
+    let (driver, seen) = until(40);
+    assert!(matches!(replay(&log, &options, driver, &seen), Err(Error::Interrupted)));
+}
+
+#[cfg(unix)]
+#[test]
+fn ctrl_c_keeps_what_was_driven_on_a_recording() {
+    let scratch = tempfile::tempdir().unwrap();
+    let dir = scratch.path();
+    record(dir);
+    let served = serve(dir, &["drive", "zero", "--on", "drive", "--out", "kept", "--json", "--watch"]);
+    let mut page = Page::open(served.port);
+    while page.next().unwrap().number("time_s") < 1.0 {}
+    served.interrupt();
+    let said = served.wait_until_it_says("stopped after");
+    assert!(said.contains("kept in kept"), "{said}");
+    assert_eq!(served.code(), Some(130));
+    let summary: serde_json::Value =
+        serde_json::from_slice(&std::fs::read(dir.join("kept/replay.json")).unwrap()).unwrap();
+    assert!(summary["time_s"].as_f64().unwrap() >= 1.0, "{summary}");
 }

@@ -7,6 +7,7 @@ use std::time::Instant;
 
 use serde::Serialize;
 
+use super::drive::stop_or_ok;
 use super::drive_sweep::{aligned, ascending};
 use super::model_arg::model_file;
 use super::recording_args::RecordingArgs;
@@ -22,7 +23,8 @@ use crate::observer::{StopSignal, Tally};
 use crate::picture::RgbImage;
 use crate::pilot::Pilot;
 use crate::replay::{
-    ReplayFrame, ReplayLog, ReplayOptions, ReplayRun, ReplaySummary, WarpCheck, replay, side_camera_check, summarise,
+    ReplayFrame, ReplayLog, ReplayOptions, ReplayRun, ReplaySummary, WarpCheck, replay_as_far, side_camera_check,
+    summarise,
 };
 use crate::report;
 use crate::report::pages::sweep::Swept;
@@ -110,31 +112,44 @@ pub fn run(args: &ReplayArgs) -> Result<()> {
         eprintln!("open {} to watch", live.url());
     }
     let drive = Drive { log: &log, options: &options, stop: &stop };
-    let timed = |drive: &dyn Fn() -> Result<Vec<ReplayRun>>| -> Result<(Vec<ReplayRun>, ReplaySummary)> {
-        let began = Instant::now();
-        let runs = drive()?;
-        let summary = summarise(&runs, began.elapsed().as_secs_f64());
-        Ok((runs, summary))
-    };
-    let (runs, summary) = pool.install(|| {
-        timed(&|| match &live {
-            Some(live) => drive.watched(&at_wheel, args.model, live),
-            None => drive.go(&at_wheel, args.model),
-        })
+    let began = Instant::now();
+    let (runs, mut stopped) = pool.install(|| match &live {
+        Some(live) => drive.watched(&at_wheel, args.model, live),
+        None => drive.go(&at_wheel, args.model),
     })?;
+    let summary = summarise(&runs, began.elapsed().as_secs_f64());
     if let Some(live) = live {
         let ReplaySummary { autonomy_percent, interventions, offset_mean_m, .. } = summary;
         live.finish(&format!(
-            "The drive of {} is over: autonomy {autonomy_percent:.1} %, put back {interventions} times, on average \
+            "The drive of {} is {}: autonomy {autonomy_percent:.1} %, put back {interventions} times, on average \
              {offset_mean_m:.2} m from the path.",
-            args.model
+            args.model,
+            if stopped { "stopped" } else { "over" }
         ));
     }
-    let other = other.map(|(name, wheel)| Ok((name, pool.install(|| timed(&|| drive.go(&wheel, name)))?.1)));
-    let other: Option<(&str, ReplaySummary)> = other.transpose()?;
+    let other = match other {
+        Some((name, wheel)) if !stopped => {
+            let began = Instant::now();
+            match pool.install(|| drive.go(&wheel, name)) {
+                Ok((runs, false)) => Some((name, summarise(&runs, began.elapsed().as_secs_f64()))),
+                // A drive along other parts of the recording is no comparison.
+                Ok((_, true)) | Err(Error::Interrupted) => {
+                    stopped = true;
+                    None
+                }
+                Err(error) => return Err(error),
+            }
+        }
+        _ => None,
+    };
+    if stopped {
+        let kept =
+            args.out.map_or("add --out DIR to keep what was driven".into(), |out| format!("kept in {}", out.display()));
+        eprintln!("stopped after {:.0} m of {}; {kept}", summary.distance_m, args.model);
+    }
     // What was driven is told, whatever fails now.
     let mut failed = Vec::new();
-    let warp = pool.install(|| side_camera_check(&log));
+    let warp = if stopped { Ok(None) } else { pool.install(|| side_camera_check(&log)) };
     let warp = warp.unwrap_or_else(|error| {
         failed.push(error);
         None
@@ -142,14 +157,14 @@ pub fn run(args: &ReplayArgs) -> Result<()> {
     if let Some(folder) = folder {
         failed.extend(report::on_recording::write(&log, &runs, &summary, folder).err());
     }
-    if let (Some(path), Some(run)) = (args.video, runs.first()) {
+    if let (Some(path), Some(run), false) = (args.video, runs.first(), stopped) {
         failed.extend(pool.install(|| drive.film(&at_wheel, args, run, path)).err());
     }
     if args.json {
         let (assumed_speed_mps, warp, against) =
             (log.assumed_speed_mps, warp.as_ref(), other.as_ref().map(|(_, summary)| summary));
         print_json(&Report { recording: args.on, summary: &summary, assumed_speed_mps, warp, against })?;
-        return end_with(failed);
+        return end_with(failed).and(stop_or_ok(stopped));
     }
     let mut text = summary_text(args.model, &summary);
     if let Some((name, summary)) = &other {
@@ -158,13 +173,13 @@ pub fn run(args: &ReplayArgs) -> Result<()> {
     if let Some(mps) = log.assumed_speed_mps {
         text += &format!("note: the recording says no speed; {mps:.1} m/s was assumed\n");
     }
-    let unchecked = || match failed.is_empty() {
+    let unchecked = || match failed.is_empty() && !stopped {
         true => "note: without side cameras the warped views cannot be checked\n".into(),
         false => String::new(),
     };
     text += &warp.map_or_else(unchecked, warp_text);
     print(&text)?;
-    end_with(failed)
+    end_with(failed).and(stop_or_ok(stopped))
 }
 
 /// A drive at one latency of several; what `--json` prints of it.
@@ -190,16 +205,31 @@ fn sweep(args: &ReplayArgs, log: &ReplayLog, pool: &rayon::ThreadPool) -> Result
         all.map(|latency_ms| ReplayOptions { latency_ms, ..ReplayOptions::usual(&log.geometry) }).collect();
     all.iter().try_for_each(ReplayOptions::check)?;
     let (wheel, stop) = (Wheel::find(args.model)?, stop_on_ctrl_c()?);
-    let mut points = Vec::new();
+    let (mut points, mut stopped) = (Vec::new(), false);
     for options in all {
         let began = Instant::now();
         let drive = Drive { log, options: &options, stop: &stop };
-        let runs = pool.install(|| drive.go(&wheel, &format!("{}, {} ms", args.model, options.latency_ms)))?;
+        let runs = match pool.install(|| drive.go(&wheel, &format!("{}, {} ms", args.model, options.latency_ms))) {
+            Ok((runs, false)) => runs,
+            // What is whole is told.
+            Ok((_, true)) | Err(Error::Interrupted) => {
+                stopped = true;
+                break;
+            }
+            Err(error) => return Err(error),
+        };
         let summary = summarise(&runs, began.elapsed().as_secs_f64());
         points.push(AtLatency { latency_ms: options.latency_ms, summary });
     }
+    if points.is_empty() {
+        return stop_or_ok(stopped);
+    }
+    if stopped {
+        eprintln!("stopped after {} of {} latencies", points.len(), args.latencies_ms.len());
+    }
     if args.json {
-        return print_json(&SweepReport { recording: args.on, driver: args.model, points: &points });
+        return print_json(&SweepReport { recording: args.on, driver: args.model, points: &points })
+            .and(stop_or_ok(stopped));
     }
     let headers = ["at", "autonomy", "put back", "off the path", "95 % below", "whiteness", "reversals", "jerk"];
     let mut rows = vec![headers.map(String::from).to_vec()];
@@ -216,7 +246,8 @@ fn sweep(args: &ReplayArgs, log: &ReplayLog, pool: &rayon::ThreadPool) -> Result
             format!("{:.1} m/s³", calm.lateral_jerk_rms_mps3),
         ]
     }));
-    print(&format!("{} on the recording\n{}", args.model, aligned(&rows)))
+    print(&format!("{} on the recording\n{}", args.model, aligned(&rows)))?;
+    stop_or_ok(stopped)
 }
 
 /// Who steers: a model, or nobody.
@@ -251,40 +282,54 @@ struct Drive<'a> {
 }
 
 impl Drive<'_> {
-    /// Drives along all sessions at once.
-    fn go(&self, wheel: &Wheel, name: &str) -> Result<Vec<ReplayRun>> {
+    /// Drives along all sessions at once; the flag is `true` if that was stopped.
+    fn go(&self, wheel: &Wheel, name: &str) -> Result<(Vec<ReplayRun>, bool)> {
         let mut bar = ShareBar::new(format!("{name} on the recording"), self.stop);
         let meters = self.log.sessions.iter().map(|session| session.path.length_m() as usize + 1).sum();
         let tally = Tally::new(meters, &mut bar);
         let reached: Vec<_> = self.log.sessions.iter().map(|_| AtomicUsize::new(0)).collect();
-        replay(self.log, self.options, || Ok(wheel.driver()), &|session, frame| {
+        replay_as_far(self.log, self.options, || Ok(wheel.driver()), &|session, frame| {
             let along = frame.moment.along_m as usize;
             let before = reached[session].swap(along, Ordering::Relaxed);
             tally.add(along.saturating_sub(before))
         })
     }
 
-    /// Drives along session number `session` alone, and shows every frame to `seen`.
+    /// Drives along session number `session` alone, and shows every frame to `seen`; the flag is `true` if that stopped it.
     fn along(
         &self,
         session: usize,
         wheel: &Wheel,
         seen: &(dyn Fn(&ReplayFrame) -> Result<()> + Sync),
-    ) -> Result<ReplayRun> {
+    ) -> Result<(ReplayRun, bool)> {
         let ReplayLog { recording, geometry, sessions, assumed_speed_mps } = self.log;
         let sessions = vec![sessions[session].clone()];
         let log = ReplayLog { recording, geometry: geometry.clone(), sessions, assumed_speed_mps: *assumed_speed_mps };
-        let mut runs = replay(&log, self.options, || Ok(wheel.driver()), &|_, frame| seen(frame))?;
-        Ok(runs.pop().unwrap_or_default())
+        let (mut runs, stopped) = replay_as_far(&log, self.options, || Ok(wheel.driver()), &|_, frame| seen(frame))?;
+        Ok((runs.pop().unwrap_or_default(), stopped))
     }
 
     /// Drives along one session after the other, in real time, before those who watch.
-    fn watched(&self, wheel: &Wheel, name: &str, live: &Live) -> Result<Vec<ReplayRun>> {
+    fn watched(&self, wheel: &Wheel, name: &str, live: &Live) -> Result<(Vec<ReplayRun>, bool)> {
         let watch = Mutex::new(WatchRecording::new(live, self.log, name, wheel.0.as_ref(), self.stop));
         let show = |session: usize, frame: &ReplayFrame| {
             watch.lock().unwrap_or_else(PoisonError::into_inner).show(session, frame)
         };
-        (0..self.log.sessions.len()).map(|k| self.along(k, wheel, &|frame| show(k, frame))).collect()
+        let (mut runs, mut stopped) = (Vec::new(), false);
+        for session in 0..self.log.sessions.len() {
+            match self.along(session, wheel, &|frame| show(session, frame)) {
+                Ok((run, ended)) => {
+                    runs.push(run);
+                    stopped = ended;
+                }
+                Err(Error::Interrupted) if !runs.is_empty() => stopped = true,
+                Err(error) => return Err(error),
+            }
+            if stopped {
+                break;
+            }
+        }
+        Ok((runs, stopped))
     }
 
     /// Films the drive along the first session, whose moments are those of `run`.
@@ -300,10 +345,11 @@ impl Drive<'_> {
         let frames = run.moments.len();
         let mut bar = ShareBar::new("filming", self.stop);
         let tally = Tally::new(frames.max(1), &mut bar);
-        self.along(0, wheel, &|frame| {
+        let (_, stopped) = self.along(0, wheel, &|frame| {
             video.lock().unwrap_or_else(PoisonError::into_inner).show(frame)?;
             tally.add(1)
         })?;
+        stop_or_ok(stopped)?;
         let video = video.into_inner().unwrap_or_else(PoisonError::into_inner);
         let summary = video.finish(&format!("put back: {}", run.interventions))?;
         drop(bar);

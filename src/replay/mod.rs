@@ -18,7 +18,7 @@ pub use fit::{CameraFit, fit_camera};
 pub use log::{Frames, ReplayLog};
 pub use run::{
     DRIVE_HZ, MAX_OFFSET_M, MAX_TURN_DEG, ReplayFrame, ReplayMoment, ReplayOptions, ReplayRun, ReplaySummary, replay,
-    summarise,
+    replay_as_far, summarise,
 };
 pub use trust::{WarpCheck, side_camera_check};
 pub use verdict::{RecordingVerdict, Side, SideVerdict, Stretch, judge, pieces};

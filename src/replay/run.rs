@@ -1,5 +1,8 @@
 //! Drives along the sessions of a recording, and what they came to.
 
+use std::ops::ControlFlow;
+use std::sync::atomic::{AtomicBool, Ordering};
+
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
@@ -181,10 +184,45 @@ pub fn replay<D>(
 where
     D: FnMut(&RgbImage) -> Result<f32>,
 {
+    match replay_as_far(log, options, new_driver, seen)? {
+        (runs, false) => Ok(runs),
+        (_, true) => Err(Error::Interrupted),
+    }
+}
+
+/// As [`replay`]; but if `seen` ends it with [`Error::Interrupted`], the runs as far as they were driven, and `true`. A session that was not
+/// begun has a run without moments.
+///
+/// # Errors
+///
+/// As [`replay`]; [`Error::Interrupted`] if nothing was driven.
+pub fn replay_as_far<D>(
+    log: &ReplayLog,
+    options: &ReplayOptions,
+    new_driver: impl Fn() -> Result<D> + Sync,
+    seen: &(dyn Fn(usize, &ReplayFrame) -> Result<()> + Sync),
+) -> Result<(Vec<ReplayRun>, bool)>
+where
+    D: FnMut(&RgbImage) -> Result<f32>,
+{
     options.check()?;
-    (log.sessions.par_iter().enumerate())
-        .map(|(number, session)| drive_session(log, session, options, new_driver()?, &|frame| seen(number, frame)))
-        .collect()
+    let stopped = AtomicBool::new(false);
+    let along = |(number, session): (usize, &DrivenSession)| {
+        let seen = |frame: &ReplayFrame| match seen(number, frame) {
+            Err(Error::Interrupted) => {
+                stopped.store(true, Ordering::Relaxed);
+                Ok(ControlFlow::Break(()))
+            }
+            other => other.map(ControlFlow::Continue),
+        };
+        drive_session(log, session, options, new_driver()?, &seen)
+    };
+    let runs: Vec<ReplayRun> = log.sessions.par_iter().enumerate().map(along).collect::<Result<_>>()?;
+    let stopped = stopped.into_inner();
+    if stopped && runs.iter().all(|run| run.moments.is_empty()) {
+        return Err(Error::Interrupted);
+    }
+    Ok((runs, stopped))
 }
 
 fn drive_session(
@@ -192,7 +230,7 @@ fn drive_session(
     session: &DrivenSession,
     options: &ReplayOptions,
     mut driver: impl FnMut(&RgbImage) -> Result<f32>,
-    seen: &dyn Fn(&ReplayFrame) -> Result<()>,
+    seen: &dyn Fn(&ReplayFrame) -> Result<ControlFlow<()>>,
 ) -> Result<ReplayRun> {
     let ReplayLog { geometry, .. } = log;
     let path = &session.path;
@@ -243,7 +281,9 @@ fn drive_session(
             put_back: std::mem::take(&mut put_back),
         };
         if let Some(view) = view {
-            seen(&ReplayFrame { view, session, moment })?;
+            if seen(&ReplayFrame { view, session, moment })?.is_break() {
+                break;
+            }
             run.moments.push(moment);
         }
         on_the_way.push_back(steering);

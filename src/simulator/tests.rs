@@ -11,6 +11,7 @@ use super::trial::run::run_trial;
 use super::trial::trajectory::trajectory_csv;
 use super::*;
 use crate::Error;
+use crate::geometry::CarGeometry;
 use crate::observer::Unobserved;
 
 fn lake_spec() -> TrackSpec {
@@ -117,6 +118,25 @@ fn hash_of(folder: &Path) -> String {
         }
     }
     hash.finalize().iter().map(|b| format!("{b:02x}")).collect()
+}
+
+#[test]
+fn a_small_car_is_recorded_with_one_camera_and_its_own_speed() {
+    let track = Track::load("lake").unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let [own, small] = [None, CarGeometry::preset("donkeycar")].map(|car| {
+        let out = folder.path().join(if car.is_some() { "small" } else { "own" });
+        record(&track, &RecordOptions { laps: 0.01, car, ..Default::default() }, &out, &mut Unobserved).unwrap();
+        crate::dataset::load_with(&out, &Default::default(), crate::dataset::ImageCheck::Verify).unwrap()
+    });
+    assert_eq!(small.geometry, CarGeometry::preset("donkeycar").unwrap());
+    assert_eq!((small.rows.len(), std::fs::read_dir(folder.path().join("small/IMG")).unwrap().count()), (13, 13));
+    let picture = std::fs::read_dir(folder.path().join("small/IMG")).unwrap().next().unwrap().unwrap().path();
+    assert_eq!(crate::picture::decode::image_size(&std::fs::read(picture).unwrap()), Ok([120, 160]));
+    for (small, own) in small.rows.iter().zip(&own.rows) {
+        assert_eq!(small.steering, own.steering);
+        assert!((small.speed_mph * 2.87 / 0.26 - own.speed_mph).abs() < 1e-3);
+    }
 }
 
 #[test]

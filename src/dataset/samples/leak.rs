@@ -23,6 +23,8 @@ const THUMBNAIL: usize = CELLS[0] * CELLS[1];
 const TWIN_LEVELS: usize = 4;
 /// Training frames compared with one validation frame at most, the nearest in mean brightness first.
 const MAX_COMPARED: usize = 4096;
+/// Rows of a side whose frames are kept for the comparison at most, 128 bytes each: of a longer side every second one, every third and so on.
+const MAX_KEPT: usize = 1 << 17;
 /// A training row this near in time gives a validation row away, in milliseconds.
 const NEAR_MS: i64 = 1000;
 
@@ -109,6 +111,11 @@ impl Thumbnail {
     }
 }
 
+/// One row in how many is compared, of a side of `rows` rows.
+pub(super) fn compared_every(rows: usize) -> usize {
+    rows.div_ceil(MAX_KEPT).max(1)
+}
+
 /// How many validation frames look the same as a training frame.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct NearTwins {
@@ -116,14 +123,16 @@ pub struct NearTwins {
     pub frames: usize,
     /// Those with a near twin on the training side.
     pub twins: usize,
+    /// One training row in how many was compared; 1 unless there are very many. There are at least as many twins as were found then.
+    pub training_every: usize,
 }
 
 impl NearTwins {
     /// Compares each validation frame with the training frames.
     ///
     /// Twins cannot differ more in mean brightness than they may differ at all, so only training frames within 4 levels
-    /// of mean brightness are compared, and of those at most the 4096 nearest.
-    pub fn count(validation: &[&Thumbnail], training: &[&Thumbnail]) -> Self {
+    /// of mean brightness are compared, and of those at most the 4096 nearest. `training` is one row in `training_every`.
+    pub fn count(validation: &[&Thumbnail], training: &[&Thumbnail], training_every: usize) -> Self {
         let mut sorted: Vec<(u32, &Thumbnail)> = training.iter().map(|frame| (frame.total(), *frame)).collect();
         sorted.sort_by_key(|(total, _)| *total);
         let reach = (TWIN_LEVELS * THUMBNAIL) as u32;
@@ -136,7 +145,7 @@ impl NearTwins {
             let end = sorted.partition_point(|(other, _)| *other <= total + reach).min(middle + MAX_COMPARED / 2);
             sorted[begin..end].iter().any(|(_, other)| frame.is_twin_of(other))
         };
-        Self { frames: validation.len(), twins: validation.par_iter().filter(has_twin).count() }
+        Self { frames: validation.len(), twins: validation.par_iter().filter(has_twin).count(), training_every }
     }
 
     /// Share of the validation frames that have a near twin.
@@ -147,9 +156,13 @@ impl NearTwins {
     /// The count in words.
     pub fn summary(&self) -> String {
         let percent = percent(100.0 * self.share());
+        let compared = match self.training_every {
+            1 => String::new(),
+            every => format!("; one training row in {every} was compared, so there may be more"),
+        };
         format!(
             "leak audit: {percent} % of the validation frames (centre camera) are nearly identical to a training frame \
-             (mean difference below {TWIN_LEVELS} grey levels at {}x{} cells)",
+             (mean difference below {TWIN_LEVELS} grey levels at {}x{} cells){compared}",
             CELLS[0], CELLS[1]
         )
     }
@@ -184,9 +197,23 @@ mod tests {
         let noisy = Thumbnail::of(&noisy, [0, 64], 64);
         let training: Vec<&Thumbnail> = frames[..10].iter().collect();
         let validation = [&noisy, &frames[15], &frames[7]];
-        assert_eq!(NearTwins::count(&validation, &training), NearTwins { frames: 3, twins: 2 });
-        assert!(NearTwins { frames: 5000, twins: 1 }.summary().contains(": <0.1 % of the validation frames"));
-        assert_eq!(NearTwins::count(&validation, &[]).twins, 0);
-        assert_eq!(NearTwins::count(&[], &training).share(), 0.0);
+        assert_eq!(NearTwins::count(&validation, &training, 1), NearTwins { frames: 3, twins: 2, training_every: 1 });
+        let few = NearTwins { frames: 5000, twins: 1, training_every: 1 };
+        assert!(few.summary().contains(": <0.1 % of the validation frames") && few.summary().ends_with("cells)"));
+        assert!(
+            NearTwins { training_every: 9, ..few }
+                .summary()
+                .ends_with("one training row in 9 was compared, so there may be more")
+        );
+        assert_eq!(NearTwins::count(&validation, &[], 1).twins, 0);
+        assert_eq!(NearTwins::count(&[], &training, 1).share(), 0.0);
+    }
+
+    #[test]
+    fn however_long_a_side_is_no_more_than_so_many_frames_are_kept() {
+        for rows in [0, 1, 1000, MAX_KEPT, MAX_KEPT + 1, 9_000_000] {
+            let every = compared_every(rows);
+            assert!(rows.div_ceil(every) <= MAX_KEPT && (rows <= MAX_KEPT) == (every == 1), "{rows}: one in {every}");
+        }
     }
 }

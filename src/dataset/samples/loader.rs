@@ -5,7 +5,7 @@
 //! threads, cache or order of calls.
 
 use super::augment::Augmentation;
-use super::leak::{NearTwins, Thumbnail};
+use super::leak::{NearTwins, Thumbnail, compared_every};
 use super::pairs::{Pairing, Wanted};
 use super::split::Split;
 use super::{Flip, Group, Item, Mirror, SampleSpec, Targets};
@@ -408,11 +408,11 @@ impl Loader {
     /// cameras beside them, were shown, so this is to be asked after the first epoch.
     pub fn near_twins(&self, training: &Loader) -> NearTwins {
         training.look_at_centres();
-        let seen = |loader: &'_ Loader| {
-            loader.thumbnails.iter().filter_map(OnceLock::get).flatten().cloned().collect::<Vec<_>>()
-        };
-        let (validation, training) = (seen(self), seen(training));
-        NearTwins::count(&validation.iter().collect::<Vec<_>>(), &training.iter().collect::<Vec<_>>())
+        NearTwins::count(&self.thumbnails_kept(), &training.thumbnails_kept(), compared_every(training.items.len()))
+    }
+
+    fn thumbnails_kept(&self) -> Vec<&Thumbnail> {
+        self.thumbnails.iter().filter_map(OnceLock::get).flatten().collect()
     }
 
     fn variants(&self) -> usize {

@@ -99,7 +99,8 @@ fn drive_run(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::simulator::trial::driver::{Expert, Zero};
+    use crate::geometry::CarGeometry;
+    use crate::simulator::trial::driver::{Expert, InCar, Zero};
 
     fn options(assisted: bool) -> TrialOptions {
         TrialOptions { laps: 1, speed: Speed::Fixed(20.0), latency_ms: 0.0, noise: 0.0, assisted }
@@ -157,6 +158,42 @@ mod tests {
         let plain = spread(options(false));
         assert!(spread(TrialOptions { latency_ms: 700.0, ..options(false) }) > 1.1 * plain);
         assert!(spread(TrialOptions { noise: 0.1, ..options(false) }) > 1.1 * plain);
+    }
+
+    #[test]
+    fn a_driver_in_another_car_sees_what_its_camera_sees_and_steers_its_wheels() {
+        struct Looking([usize; 2]);
+        impl Driver for Looking {
+            fn steer(&mut self, frame: &RgbFrame, state: &DriveState) -> f32 {
+                assert_eq!((frame.size, frame.pixels.len()), (self.0, 3 * self.0[0] * self.0[1]));
+                0.5 * expert::pursuit(state.simulation) as f32
+            }
+        }
+        let track = Track::load("lake").unwrap();
+        let drive = |driver: &mut dyn Driver| {
+            let mut closed = Vec::new();
+            let mut watch = |event: DriveEvent| {
+                if let DriveEvent::Frame(frame) = event {
+                    closed.push((frame.simulation.cte_m(), frame.steering));
+                }
+                if closed.len() == 200 { Err(crate::Error::Interrupted) } else { Ok(()) }
+            };
+            let ended = run_trial_observed(&track, driver, &options(false), 2, &mut watch);
+            assert!(matches!(ended, Err(crate::Error::Interrupted)));
+            closed
+        };
+        let donkey = CarGeometry::preset("donkeycar").unwrap();
+        let plain = drive(&mut Looking([160, 320]));
+        assert_eq!(drive(&mut InCar { driver: Looking([120, 160]), car: donkey }), plain);
+        // Wheels that turn twice as far bring half the steering to the expert's.
+        let wide = CarGeometry { full_lock_deg: 50.0, ..CarGeometry::simulator() };
+        let turned = drive(&mut InCar { driver: Looking([160, 320]), car: wide });
+        assert!(
+            turned.iter().zip(&plain).take(1).all(|(a, b)| (a.1 / b.1 - 2.0).abs() < 0.1),
+            "{:?} {:?}",
+            turned[0],
+            plain[0]
+        );
     }
 
     #[test]

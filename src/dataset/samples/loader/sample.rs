@@ -146,7 +146,7 @@ impl Loader {
             *preprocessor = planned.map_err(|error| failed(error.to_string()))?;
         }
         self.thumbnails[self.pictures[image as usize] as usize]
-            .get_or_init(|| (camera == View::Centre).then(|| self.thumbnail(decoded)));
+            .get_or_init(|| (camera == View::Centre && self.is_compared(image)).then(|| self.thumbnail(decoded)));
         self.times.preprocess.time(|| {
             if keeps_rgb(&self.spec, self.training, self.flip) {
                 preprocessor.to_rgb_stage(&decoded.pixels, out);
@@ -167,6 +167,11 @@ impl Loader {
         decode_rgb(file, decoded).map_err(|message| format!("{}: {message}", path.display()))
     }
 
+    /// Whether the audit of near twins looks at the row of this image.
+    fn is_compared(&self, image: u32) -> bool {
+        (self.images[image as usize].0 as usize).is_multiple_of(compared_every(self.items.len()))
+    }
+
     fn thumbnail(&self, decoded: &RgbImage) -> Thumbnail {
         let Preprocessing { rows, source, .. } = self.spec.preprocessing;
         Thumbnail::of(decoded, rows, source[0])
@@ -181,7 +186,11 @@ impl Loader {
             |(file, decoded): &mut (_, RgbImage), item| {
                 let images = self.first_images[item]..self.first_images[item + 1];
                 let centre = images.clone().find(|&image| self.images[image as usize].1 == View::Centre);
-                let Some(centre) = centre.filter(|&centre| !known(centre) && images.clone().any(known)) else { return };
+                let Some(centre) =
+                    centre.filter(|&centre| self.is_compared(centre) && !known(centre) && images.clone().any(known))
+                else {
+                    return;
+                };
                 // Pictures that cannot be read are told where they are trained on.
                 if self.read(centre, file, decoded).is_ok() {
                     let _ = self.thumbnails[self.pictures[centre as usize] as usize].set(Some(self.thumbnail(decoded)));
