@@ -266,7 +266,7 @@ fn a_drive_that_is_interrupted_gives_what_was_driven() {
     let whole = drive(&log, 0.0, |_| 0.0);
     let (driver, seen) = until(40);
     let (runs, stopped) = replay_as_far(&log, &options, driver, &seen).unwrap();
-    assert!(stopped && runs[0].moments[..] == whole[0].moments[..40], "{}", runs[0].moments.len());
+    assert!(stopped && !runs[0].whole && runs[0].moments[..] == whole[0].moments[..40], "{}", runs[0].moments.len());
     assert!((runs[0].time_s - 2.0).abs() < 1e-9 && (1.0..40.0).contains(&runs[0].distance_m), "{:?}", runs[0].time_s);
     let (driver, seen) = until(usize::MAX);
     assert_eq!(replay_as_far(&log, &options, driver, &seen).unwrap(), (whole, false));
@@ -292,4 +292,11 @@ fn ctrl_c_keeps_what_was_driven_on_a_recording() {
     let summary: serde_json::Value =
         serde_json::from_slice(&std::fs::read(dir.join("kept/replay.json")).unwrap()).unwrap();
     assert!(summary["time_s"].as_f64().unwrap() >= 1.0, "{summary}");
+    let drive: serde_json::Value =
+        serde_json::from_slice(&std::fs::read(dir.join("kept/summary.json")).unwrap()).unwrap();
+    assert_eq!(
+        (&drive["laps_completed"], &drive["laps_total"]),
+        (&0.into(), &1.into()),
+        "no lap was driven to its end"
+    );
 }

@@ -83,7 +83,7 @@ enum SubjectArg {
     Labels,
     /// Models of all qualities: does driving on a recording tell how they drive in the simulator?
     Replay,
-    /// Averaged weights, terms of smoothness, blur before strides: what makes the wheel calm
+    /// Averaged weights, noise in the pictures, terms of smoothness, blur before strides: what makes the wheel calm
     Smooth,
 }
 

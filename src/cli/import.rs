@@ -62,8 +62,9 @@ pub struct ImportArgs {
 /// A model under the right preprocessing goes with the labels better than this.
 const WEAK_CORRELATION: f64 = 0.3;
 
-/// Gains from the first to the second, and biases up to the third, need no `--output-scale`: another driver's hands explain them.
+/// Gains in this range need no `--output-scale`: another driver's hands explain them.
 const USUAL_GAIN: std::ops::RangeInclusive<f64> = 0.4..=2.5;
+/// Nor do biases up to this, shares of full lock.
 const USUAL_BIAS: f64 = 0.2;
 
 fn parse_lambda(text: &str) -> Result<(String, (f64, f64)), String> {

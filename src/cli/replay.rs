@@ -127,6 +127,11 @@ pub fn run(args: &ReplayArgs) -> Result<()> {
             if stopped { "stopped" } else { "over" }
         ));
     }
+    if stopped {
+        let kept =
+            args.out.map_or("add --out DIR to keep what was driven".into(), |out| format!("kept in {}", out.display()));
+        eprintln!("stopped after {:.0} m of {}; {kept}", summary.distance_m, args.model);
+    }
     let other = match other {
         Some((name, wheel)) if !stopped => {
             let began = Instant::now();
@@ -134,6 +139,7 @@ pub fn run(args: &ReplayArgs) -> Result<()> {
                 Ok((runs, false)) => Some((name, summarise(&runs, began.elapsed().as_secs_f64()))),
                 // A drive along other parts of the recording is no comparison.
                 Ok((_, true)) | Err(Error::Interrupted) => {
+                    eprintln!("stopped in the drive of {name}; that of {} is whole", args.model);
                     stopped = true;
                     None
                 }
@@ -142,10 +148,8 @@ pub fn run(args: &ReplayArgs) -> Result<()> {
         }
         _ => None,
     };
-    if stopped {
-        let kept =
-            args.out.map_or("add --out DIR to keep what was driven".into(), |out| format!("kept in {}", out.display()));
-        eprintln!("stopped after {:.0} m of {}; {kept}", summary.distance_m, args.model);
+    if stopped && args.video.is_some() {
+        eprintln!("no film was made");
     }
     // What was driven is told, whatever fails now.
     let mut failed = Vec::new();

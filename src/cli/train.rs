@@ -206,14 +206,20 @@ pub fn run(args: TrainArgs) -> Result<()> {
             let validate = args.reading.expand(args.validate)?;
             let simulator = match args.with_simulator {
                 Some(_) => {
-                    let (of_user, said, takes) =
-                        ([&recordings[..], &validate].concat(), args.reading.said(), training_set::takes());
+                    let (of_user, said, takes) = (
+                        [&recordings[..], &validate].concat(),
+                        args.reading.said(),
+                        training_set::labelled(&training_set::takes(), &recipe),
+                    );
                     let set = || simulator_set(RECORDINGS.as_ref(), &takes, &of_user, &said, &mut display, &stop);
                     let set = pool.install(set);
                     display.finish();
                     explain_stop(set, None)?
                 }
-                None => Vec::new(),
+                None => {
+                    recipe.labels.notice_without_expert().iter().for_each(|notice| eprintln!("note: {notice}"));
+                    Vec::new()
+                }
             };
             let run = NewRun::at(args.out, &recipe.name)?;
             let out = run.path().to_path_buf();

@@ -36,8 +36,8 @@ pub use recording::{Recording, Row, SESSION_GAP_MS, View};
 pub use rows::ImageCheck;
 pub(crate) use rows::{LeftOut, NO_NUMBER};
 pub use samples::{
-    Balance, Correction, Flip, Group, Item, LabelKind, LabelSpec, Mirror, OutputKind, OutputSpec, Outputs, SampleSpec,
-    Targets, augment, leak, loader, split, takeover, whole,
+    Balance, Correction, EXPERT_AHEAD_M, Flip, Group, Item, LabelKind, LabelSpec, Mirror, OutputKind, OutputSpec,
+    Outputs, SampleSpec, Targets, augment, leak, loader, split, takeover, whole,
 };
 pub use unusable::{Reason, Tally, Unusable};
 

@@ -52,11 +52,15 @@ pub(super) fn train(
         }
         let simulator = match with_simulator {
             Some(_) => {
-                let (of_user, takes) = ([&recordings[..], &validate].concat(), training_set::takes());
+                let (of_user, takes) =
+                    ([&recordings[..], &validate].concat(), training_set::labelled(&training_set::takes(), &recipe));
                 let stop = reporter.stop.clone();
                 simulator_set(RECORDINGS.as_ref(), &takes, &of_user, &said, reporter, &stop)?
             }
-            None => Vec::new(),
+            None => {
+                recipe.labels.notice_without_expert().into_iter().for_each(|notice| reporter.notice(notice.into()));
+                Vec::new()
+            }
         };
         let run = NewRun::at(out, &recipe.name)?;
         let out = run.path().to_path_buf();

@@ -101,6 +101,8 @@ pub struct ReplayRun {
     pub moments: Vec<ReplayMoment>,
     /// Angle of the front wheels at steering 1, deg.
     pub full_lock_deg: f64,
+    /// Whether the session was driven to its end.
+    pub whole: bool,
     /// Times the car was put back.
     pub interventions: usize,
     /// Way along the path, m.
@@ -114,6 +116,11 @@ pub struct ReplayRun {
 }
 
 impl ReplayRun {
+    /// Whether anything of the session was driven, or there was nothing to drive.
+    pub fn begun(&self) -> bool {
+        self.whole || !self.moments.is_empty()
+    }
+
     /// Share of the time in which nobody had to help, %.
     pub fn autonomy_percent(&self) -> f64 {
         autonomy_percent(self.interventions, self.time_s)
@@ -234,7 +241,7 @@ fn drive_session(
 ) -> Result<ReplayRun> {
     let ReplayLog { geometry, .. } = log;
     let path = &session.path;
-    let mut run = ReplayRun { full_lock_deg: geometry.full_lock_deg, ..ReplayRun::default() };
+    let mut run = ReplayRun { full_lock_deg: geometry.full_lock_deg, whole: true, ..ReplayRun::default() };
     let mut eye = Eye::default();
     let Some(mut pose) = path.pose_at(0.0) else { return Ok(run) };
     let mut at_m = 0.0;
@@ -282,6 +289,7 @@ fn drive_session(
         };
         if let Some(view) = view {
             if seen(&ReplayFrame { view, session, moment })?.is_break() {
+                run.whole = false;
                 break;
             }
             run.moments.push(moment);
@@ -350,7 +358,7 @@ pub fn summarise(runs: &[ReplayRun], seconds: f64) -> ReplaySummary {
     let n = offsets.len().max(1) as f64;
     let p95 = offsets.get(((offsets.len() as f64 * 0.95) as usize).min(offsets.len().saturating_sub(1)));
     ReplaySummary {
-        sessions: runs.len(),
+        sessions: runs.iter().filter(|run| run.begun()).count(),
         autonomy_percent: autonomy_percent(interventions, time_s),
         interventions,
         interventions_per_km: interventions as f64 / (distance_m / 1000.0).max(1e-9),

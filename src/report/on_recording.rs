@@ -15,18 +15,18 @@ use crate::simulator::trial::trajectory::SUMMARY;
 const MAP: [f64; 2] = [760.0, 620.0];
 
 /// The measures of a drive along all sessions of `log` in the fields of a drive on a track: a session is a run and a lap, and
-/// complete if nobody had to help; distances are those from the driven path; the expert is who drove.
+/// complete if it was driven to its end and nobody had to help; distances are those from the driven path; the expert is who drove.
 pub fn drive_summary(log: &ReplayLog, runs: &[ReplayRun], summary: &ReplaySummary) -> DriveSummary {
-    let whole = runs.iter().filter(|run| run.interventions == 0).count();
-    let (completed_low, completed_high) = wilson_interval(whole, runs.len());
+    let completed = runs.iter().filter(|run| run.whole && run.interventions == 0).count();
+    let (completed_low, completed_high) = wilson_interval(completed, summary.sessions);
     let place = log.recording.path.file_name().unwrap_or(log.recording.path.as_os_str()).to_string_lossy().into_owned();
     DriveSummary {
         track: format!("{place} (recording)"),
         held_out: false,
         trained_on_held_out: Vec::new(),
-        runs: runs.len(),
-        laps_completed: whole,
-        laps_total: runs.len(),
+        runs: summary.sessions,
+        laps_completed: completed,
+        laps_total: summary.sessions,
         completed_low,
         completed_high,
         autonomy_percent: summary.autonomy_percent,
@@ -77,7 +77,8 @@ pub fn write(log: &ReplayLog, runs: &[ReplayRun], summary: &ReplaySummary, folde
     let json = |name: &str, value: serde_json::Result<String>| -> Result<()> {
         put(name, (value.map_err(|e| Error::data(name, e.to_string()))? + "\n").as_bytes())
     };
-    for (number, (run, session)) in runs.iter().zip(&log.sessions).enumerate() {
+    let begun = runs.iter().zip(&log.sessions).enumerate().filter(|(_, (run, _))| run.begun());
+    for (number, (run, session)) in begun {
         put(&format!("assisted_{}.csv", number + 1), moments_csv(run).as_bytes())?;
         let way: Vec<MapPoint> = (run.moments.iter())
             .map(|m| MapPoint { x: m.x_m, y: m.y_m, cte_m: m.offset_m, put_back: m.put_back })

@@ -1,5 +1,7 @@
 //! What the label of a row is: the `labels` entry of a recipe, and the steering of a car that stands beside the driven path.
 
+use std::ops::RangeInclusive;
+
 use serde::{Deserialize, Serialize};
 
 use super::augment::Augmentation;
@@ -49,7 +51,18 @@ impl Default for LabelSpec {
     }
 }
 
+/// What [`LabelSpec::expert_ahead_m`] may be, m.
+pub const EXPERT_AHEAD_M: RangeInclusive<f64> = 3.0..=30.0;
+
 impl LabelSpec {
+    /// What to tell of an entry that has no effect where only recordings are trained on, if there is one.
+    pub fn notice_without_expert(&self) -> Option<&'static str> {
+        self.expert_ahead_m.map(|_| {
+            "labels.expert_ahead_m acts on the simulator's expert only (train without a recording, or --with-simulator); the labels of these \
+             recordings, for which side_cameras and shift_steering_per_px of the recipe may be wrong, stay as they are"
+        })
+    }
+
     /// Whether this is what stands for an entry that is absent.
     pub fn is_default(&self) -> bool {
         *self == Self::default()
@@ -69,8 +82,9 @@ impl LabelSpec {
         if !(0.0..=5.0).contains(&self.shift_s) {
             return Err(Error::Usage("labels.shift_s: must be 0 to 5 s".into()));
         }
-        if self.expert_ahead_m.is_some_and(|ahead_m| !(3.0..=30.0).contains(&ahead_m)) {
-            return Err(Error::Usage("labels.expert_ahead_m: must be 3 to 30 m".into()));
+        if self.expert_ahead_m.is_some_and(|ahead_m| !EXPERT_AHEAD_M.contains(&ahead_m)) {
+            let (low, high) = (EXPERT_AHEAD_M.start(), EXPERT_AHEAD_M.end());
+            return Err(Error::Usage(format!("labels.expert_ahead_m: must be {low} to {high} m")));
         }
         Ok(())
     }

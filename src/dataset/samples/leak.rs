@@ -123,16 +123,17 @@ pub struct NearTwins {
     pub frames: usize,
     /// Those with a near twin on the training side.
     pub twins: usize,
-    /// One training row in how many was compared; 1 unless there are very many. There are at least as many twins as were found then.
-    pub training_every: usize,
+    /// One row in how many was compared, of the validation and of the training side; 1 unless there are very many.
+    pub one_row_in: [usize; 2],
 }
 
 impl NearTwins {
     /// Compares each validation frame with the training frames.
     ///
     /// Twins cannot differ more in mean brightness than they may differ at all, so only training frames within 4 levels
-    /// of mean brightness are compared, and of those at most the 4096 nearest. `training` is one row in `training_every`.
-    pub fn count(validation: &[&Thumbnail], training: &[&Thumbnail], training_every: usize) -> Self {
+    /// of mean brightness are compared, and of those at most the 4096 nearest. They are one row in `one_row_in` of
+    /// the validation and of the training side.
+    pub fn count(validation: &[&Thumbnail], training: &[&Thumbnail], one_row_in: [usize; 2]) -> Self {
         let mut sorted: Vec<(u32, &Thumbnail)> = training.iter().map(|frame| (frame.total(), *frame)).collect();
         sorted.sort_by_key(|(total, _)| *total);
         let reach = (TWIN_LEVELS * THUMBNAIL) as u32;
@@ -145,7 +146,7 @@ impl NearTwins {
             let end = sorted.partition_point(|(other, _)| *other <= total + reach).min(middle + MAX_COMPARED / 2);
             sorted[begin..end].iter().any(|(_, other)| frame.is_twin_of(other))
         };
-        Self { frames: validation.len(), twins: validation.par_iter().filter(has_twin).count(), training_every }
+        Self { frames: validation.len(), twins: validation.par_iter().filter(has_twin).count(), one_row_in }
     }
 
     /// Share of the validation frames that have a near twin.
@@ -156,9 +157,11 @@ impl NearTwins {
     /// The count in words.
     pub fn summary(&self) -> String {
         let percent = percent(100.0 * self.share());
-        let compared = match self.training_every {
-            1 => String::new(),
-            every => format!("; one training row in {every} was compared, so there may be more"),
+        let compared = match self.one_row_in {
+            [1, 1] => String::new(),
+            [validation, training] => format!(
+                "; looked at was one validation row in {validation} beside one training row in {training}, so there may be more"
+            ),
         };
         format!(
             "leak audit: {percent} % of the validation frames (centre camera) are nearly identical to a training frame \
@@ -197,16 +200,19 @@ mod tests {
         let noisy = Thumbnail::of(&noisy, [0, 64], 64);
         let training: Vec<&Thumbnail> = frames[..10].iter().collect();
         let validation = [&noisy, &frames[15], &frames[7]];
-        assert_eq!(NearTwins::count(&validation, &training, 1), NearTwins { frames: 3, twins: 2, training_every: 1 });
-        let few = NearTwins { frames: 5000, twins: 1, training_every: 1 };
+        assert_eq!(
+            NearTwins::count(&validation, &training, [1; 2]),
+            NearTwins { frames: 3, twins: 2, one_row_in: [1; 2] }
+        );
+        let few = NearTwins { frames: 5000, twins: 1, one_row_in: [1; 2] };
         assert!(few.summary().contains(": <0.1 % of the validation frames") && few.summary().ends_with("cells)"));
         assert!(
-            NearTwins { training_every: 9, ..few }
+            NearTwins { one_row_in: [1, 9], ..few }
                 .summary()
-                .ends_with("one training row in 9 was compared, so there may be more")
+                .ends_with("one validation row in 1 beside one training row in 9, so there may be more")
         );
-        assert_eq!(NearTwins::count(&validation, &[], 1).twins, 0);
-        assert_eq!(NearTwins::count(&[], &training, 1).share(), 0.0);
+        assert_eq!(NearTwins::count(&validation, &[], [1; 2]).twins, 0);
+        assert_eq!(NearTwins::count(&[], &training, [1; 2]).share(), 0.0);
     }
 
     #[test]

@@ -408,7 +408,8 @@ impl Loader {
     /// cameras beside them, were shown, so this is to be asked after the first epoch.
     pub fn near_twins(&self, training: &Loader) -> NearTwins {
         training.look_at_centres();
-        NearTwins::count(&self.thumbnails_kept(), &training.thumbnails_kept(), compared_every(training.items.len()))
+        let one_row_in = [self, training].map(|side| compared_every(side.items.len()));
+        NearTwins::count(&self.thumbnails_kept(), &training.thumbnails_kept(), one_row_in)
     }
 
     fn thumbnails_kept(&self) -> Vec<&Thumbnail> {

@@ -13,6 +13,6 @@ pub mod takeover;
 pub mod whole;
 
 pub use balance::Balance;
-pub use labels::{LabelKind, LabelSpec, Targets};
+pub use labels::{EXPERT_AHEAD_M, LabelKind, LabelSpec, Targets};
 pub use outputs::{OutputKind, OutputSpec, Outputs};
 pub use spec::{Correction, Flip, Group, Item, Mirror, SampleSpec};

@@ -4,7 +4,7 @@ use crate::dataset::colour::Colour;
 use crate::dataset::preprocess::Preprocessing;
 use crate::dataset::resize::Interpolation;
 use crate::engine::layers::Family;
-use crate::engine::network::Network;
+use crate::engine::network::{LayerSpec, Network};
 use crate::engine::tensor::Shape;
 
 /// Height of Udacity's picture, which [`CROPS`] refers to.
@@ -53,8 +53,9 @@ pub fn combinations(network: &Network, source: [usize; 2]) -> Vec<Preprocessing>
         1 => &SINGLE_PLANES,
         _ => &[],
     };
-    // A network that scales by itself wants grey levels.
-    let first = network.layers().iter().find(|layer| layer.spec.family() != Family::Rearrangement);
+    // A network that scales by itself, perhaps after it has cropped or resized, wants grey levels.
+    let keeps_grey_levels = |spec: &LayerSpec| spec.family() == Family::Rearrangement || spec.base_name() == "resize";
+    let first = network.layers().iter().find(|layer| !keeps_grey_levels(&layer.spec));
     let scales_itself = first.is_some_and(|layer| layer.spec.family() == Family::Normalization);
     let scalings = if scales_itself { &SCALINGS[..1] } else { &SCALINGS[..] };
     let mut crops: Vec<[usize; 2]> = Vec::new();
@@ -89,7 +90,7 @@ pub fn variants(best: &Preprocessing) -> Vec<Preprocessing> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::engine::layers::{DenseSpec, ScaleSpec};
+    use crate::engine::layers::{DenseSpec, ResizeMethod, ResizeSpec, ScaleSpec};
     use steersman_kernels::Isa;
 
     fn network(scales_itself: bool) -> Network {
@@ -108,6 +109,11 @@ mod tests {
         }
         let all = combinations(&network(false), [160, 320]);
         assert_eq!(all.len(), COLOURS.len() * CROPS.len() * SCALINGS.len());
+        let resize = ResizeSpec { to: [2, 4], method: ResizeMethod::default() }.into();
+        let scale = ScaleSpec { factor: 1.0 / 255.0, offset: 0.0 }.into();
+        let dense = DenseSpec { units: 1, init: Default::default() }.into();
+        let resizes = Network::new(Shape::new(3, 4, 8), &[resize, scale, dense], Isa::PORTABLE).unwrap();
+        assert_eq!(combinations(&resizes, [160, 320]).len(), COLOURS.len() * CROPS.len(), "it scales after it resizes");
         let twice = all.iter().enumerate().any(|(i, p)| all[..i].contains(p));
         assert!(!twice && all.iter().all(|p| p.validate().is_ok()));
     }

@@ -5,6 +5,7 @@ use std::path::Path;
 
 use serde::Serialize;
 
+use crate::dataset::EXPERT_AHEAD_M;
 use crate::geometry::CarGeometry;
 use crate::simulator::camera::foreign_car;
 use crate::simulator::car::dynamics::STEPS_PER_S;
@@ -45,7 +46,7 @@ pub struct RecordOptions {
     /// Drive slower than that before and in bends, so that the car is pushed sideways by at most this, m/s².
     pub bends_mps2: Option<f64>,
     /// The labels are the steering towards the point of the line this far ahead of the rear axle, m, and not the expert's own,
-    /// which drives. From farther away a place beside the line asks for less steering, in proportion to 1 / distance².
+    /// which drives ([`LabelSpec::expert_ahead_m`](crate::dataset::LabelSpec::expert_ahead_m) in a recipe). From farther away a place beside the line asks for less steering, in proportion to 1 / distance².
     pub label_ahead_m: Option<f64>,
     /// Strength of a disturbance of the steering that the labels do not show: standard deviation of the steering.
     pub noise: f64,
@@ -83,9 +84,9 @@ impl RecordOptions {
             let mps2 = self.bends_mps2.unwrap_or_default();
             return Err(Error::Usage(format!("{mps2} m/s² in bends: 0.5 to 8 can be recorded")));
         }
-        if self.label_ahead_m.is_some_and(|ahead_m| !(3.0..=30.0).contains(&ahead_m)) {
-            let ahead_m = self.label_ahead_m.unwrap_or_default();
-            return Err(Error::Usage(format!("labels that look {ahead_m} m ahead: 3 to 30 m can be recorded")));
+        if let Some(ahead_m) = self.label_ahead_m.filter(|ahead_m| !EXPERT_AHEAD_M.contains(ahead_m)) {
+            let (low, high) = (EXPERT_AHEAD_M.start(), EXPERT_AHEAD_M.end());
+            return Err(Error::Usage(format!("labels that look {ahead_m} m ahead: {low} to {high} m can be recorded")));
         }
         if self.hz == 0 || !STEPS_PER_S.is_multiple_of(self.hz) {
             return Err(Error::Usage(format!("{} rows a second: 1, 2, 5, 10, 25 or 50 can be recorded", self.hz)));
