@@ -133,6 +133,11 @@ fn a_small_car_is_recorded_with_one_camera_and_its_own_speed() {
     assert_eq!((small.rows.len(), std::fs::read_dir(folder.path().join("small/IMG")).unwrap().count()), (13, 13));
     let picture = std::fs::read_dir(folder.path().join("small/IMG")).unwrap().next().unwrap().unwrap().path();
     assert_eq!(crate::picture::decode::image_size(&std::fs::read(picture).unwrap()), Ok([120, 160]));
+    let side = |out: &str| fs::read_to_string(folder.path().join(out).join("recording.toml")).unwrap();
+    let [own_side, small_side]: [toml::Table; 2] = ["own", "small"].map(|out| side(out).parse().unwrap());
+    assert!(!own_side.contains_key("scale"));
+    assert!((small_side["scale"].as_float().unwrap() - 2.87 / 0.26).abs() < 1e-9);
+    assert_eq!(own_side["speed_mph"], small_side["speed_mph"], "on the track");
     for (small, own) in small.rows.iter().zip(&own.rows) {
         assert_eq!(small.steering, own.steering);
         assert!((small.speed_mph * 2.87 / 0.26 - own.speed_mph).abs() < 1e-3);
