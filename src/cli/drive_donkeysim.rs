@@ -1,5 +1,6 @@
 //! `steersman drive MODEL --donkeysim`: the model drives the car of DonkeySim.
 
+use std::net::{IpAddr, SocketAddr};
 use std::path::Path;
 
 use clap::Args;
@@ -18,6 +19,7 @@ use crate::simulator::DriverAnswer;
 use crate::simulator::trial::outcome::Failure;
 use crate::simulator::trial::trajectory::trajectory_csv;
 use crate::simulator_client::ClientEvent;
+use crate::text::excerpt;
 
 /// Highest or widest picture that is decoded, pixels.
 const MAX_SIDE: usize = 1920;
@@ -66,10 +68,27 @@ fn setting(text: &str) -> Result<(String, f64), String> {
     parts.ok_or_else(|| "a name and a number are meant, as in fov=80".into())
 }
 
-/// `HOST:PORT`; the usual port if there is none.
-fn with_port(server: &str) -> String {
-    let has_port = server.rsplit_once(':').is_some_and(|(_, port)| port.parse::<u16>().is_ok());
-    if has_port { server.into() } else { format!("{server}:{DEFAULT_PORT}") }
+/// `HOST:PORT`; the usual port if there is none. An address of IPv6 stands in brackets, or alone.
+fn with_port(server: &str) -> Result<String> {
+    if let Ok(address) = server.parse::<IpAddr>() {
+        return Ok(SocketAddr::new(address, DEFAULT_PORT).to_string());
+    }
+    let wrong = |what: &str| Err(Error::Usage(format!("--donkeysim {}: {what}", excerpt(server, 80))));
+    // What follows the host.
+    let end = match server.starts_with('[') {
+        true => server.find(']').map_or(server.len(), |bracket| bracket + 1),
+        false => server.find(':').unwrap_or(server.len()),
+    };
+    let (host, rest) = server.split_at(end);
+    match rest.strip_prefix(':') {
+        _ if host.is_empty() => wrong("HOST:PORT is meant, as in 127.0.0.1:9091"),
+        None if rest.is_empty() => Ok(format!("{server}:{DEFAULT_PORT}")),
+        Some(port) if port.contains(':') => {
+            wrong("an address of IPv6 with a port stands in brackets, as in [::1]:9091")
+        }
+        Some(port) if port.parse::<u16>().is_ok_and(|port| port > 0) => Ok(server.into()),
+        _ => wrong("the port is a number from 1 to 65535, as in 127.0.0.1:9091"),
+    }
 }
 
 pub fn run(args: &DriveArgs) -> Result<()> {
@@ -79,7 +98,7 @@ pub fn run(args: &DriveArgs) -> Result<()> {
     };
     let given = &args.donkeysim;
     let options = DonkeyDriveOptions {
-        server: with_port(given.donkeysim.as_deref().unwrap_or_default()),
+        server: with_port(given.donkeysim.as_deref().unwrap_or_default())?,
         scene: given.scene.clone(),
         picture: pilot.recipe().preprocessing.source,
         camera: given.cam.clone(),
@@ -115,7 +134,7 @@ pub fn run(args: &DriveArgs) -> Result<()> {
             Some(out) => format!("kept in {}", out.display()),
             None => "add --out DIR to keep what was driven".into(),
         };
-        eprintln!("ended early, after {} of {}; {kept}", counted(summary.runs, "run"), options.runs);
+        eprintln!("ended early, in run {} of {}; {kept}", driven.last_run, options.runs);
     }
     // What was measured is told even if it cannot be saved.
     let saved = folder.map_or(Ok(()), |folder| {
@@ -167,7 +186,7 @@ fn text(model: &str, s: &DonkeyDriveSummary, driven: &DonkeyDrive) -> String {
         "{model} in DonkeySim at {}{scene}, {}; units of the scene as m\n\
          laps completed             {}/{} (whole runs: {low:.0} to {high:.0} %, 95 %)\n\
          autonomy                   {:.1} % (6 s for each run that failed)\n\
-         runs that failed           {}: {} hit something, {} left the road, {} stood still\n\
+         runs that failed           {}: {} hit something, {} left the road, {} stood still, {} disqualified\n\
          distance driven            {:.0} m in {:.1} s\n\
          cross-track mean/RMS/p95   {mean} / {rms} / {p95} m, at most {max} m\n\
          mean speed                 {:.1} mph\n\
@@ -183,6 +202,7 @@ fn text(model: &str, s: &DonkeyDriveSummary, driven: &DonkeyDrive) -> String {
         of(Failure::Crash),
         of(Failure::LeftRoad),
         of(Failure::StoodStill),
+        of(Failure::Disqualified),
         s.distance_m,
         s.time_s,
         s.mean_speed_mph,
@@ -193,4 +213,39 @@ fn text(model: &str, s: &DonkeyDriveSummary, driven: &DonkeyDrive) -> String {
         or_dash(s.answer_ms_p50, 2),
         or_dash(s.answer_ms_p99, 2),
     )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_usual_port_is_added_where_none_is_given_and_none_is_misread() {
+        for (given, meant) in [
+            ("127.0.0.1", "127.0.0.1:9091"),
+            ("127.0.0.1:80", "127.0.0.1:80"),
+            ("localhost", "localhost:9091"),
+            ("sim.example:65535", "sim.example:65535"),
+            ("::1", "[::1]:9091"),
+            ("fe80::9091", "[fe80::9091]:9091"),
+            ("[::1]", "[::1]:9091"),
+            ("[::1]:7", "[::1]:7"),
+        ] {
+            assert_eq!(with_port(given).unwrap(), meant);
+        }
+        for (given, remedy) in [
+            ("localhost:99999", "1 to 65535"),
+            ("localhost:0", "1 to 65535"),
+            ("localhost:", "1 to 65535"),
+            ("localhost:x", "1 to 65535"),
+            ("[::1]:99999", "1 to 65535"),
+            ("[::1]9091", "1 to 65535"),
+            ("a:b:1", "[::1]:9091"),
+            ("", "HOST:PORT"),
+            (":9091", "HOST:PORT"),
+        ] {
+            let message = with_port(given).unwrap_err().to_string();
+            assert!(message.contains(remedy), "{given}: {message}");
+        }
+    }
 }

@@ -39,7 +39,7 @@ pub struct RecordArgs {
     /// Draws where the drive begins, its light and its texture
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Speed to hold, mph; with --manual the highest
+    /// Speed to hold, mph, on the full-size track also with --camera donkeycar; with --manual the highest
     #[arg(long, default_value_t = 20.0, value_name = "MPH")]
     speed: f64,
     /// Drive slower than --speed before and in bends, so that the car is pushed sideways by at most MPS2, m/s² [default: 2.5]

@@ -164,6 +164,7 @@ impl Summary {
             Some(Failure::Crash) => ", then hit a wall",
             Some(Failure::LeftRoad) => ", then left the road",
             Some(Failure::StoodStill) => ", then stood still",
+            Some(Failure::Disqualified) => ", then was disqualified",
         };
         println!("laps completed             {}/{}{failure}", self.laps_completed, self.laps_total);
         println!("distance driven            {:.0} m in {:.1} s", self.distance_m, self.time_s);

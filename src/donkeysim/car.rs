@@ -149,10 +149,11 @@ impl<'a> DonkeyCar<'a> {
     fn picture(&mut self) -> Result<String> {
         let frame = self.camera.frame(&self.simulation);
         let [height, width] = self.size;
-        // The largest part of what the camera sees with that shape.
+        // The largest part of what the camera sees with that shape; even numbers are cut off, so that the middle stays.
         let [high, wide] = frame.size;
         let rows = high.min(wide * height / width).max(1);
         let columns = wide.min(high * width / height).max(1);
+        let (rows, columns) = (rows + (high - rows) % 2, columns + (wide - columns) % 2);
         let (top, left) = ((high - rows) / 2, (wide - columns) / 2);
         let row = |y: usize| &frame.pixels[(y * wide + left) * 3..(y * wide + left + columns) * 3];
         let part: Vec<u8> = (top..top + rows).flat_map(|y| row(y).iter().copied()).collect();

@@ -32,6 +32,8 @@ const MAX_ARRIVED: usize = 256;
 const MAX_NOTICES: usize = 20;
 /// Most names of scenes that are listed.
 const MAX_NAMES: usize = 40;
+/// Most characters of a name that are shown.
+const MAX_NAME_CHARS: usize = 40;
 /// The scene that is chosen if none is named.
 const USUAL_SCENE: &str = "generated_track";
 /// Relative difference of two shapes of pictures that are the same.
@@ -56,7 +58,7 @@ pub type DonkeyDriver<'a> = dyn FnMut(DonkeyFrame) -> Result<DriverAnswer, Strin
 /// # Errors
 ///
 /// [`Error::Usage`] for impossible options and for a scene that is not there, [`Error::Connection`] with the remedy if the simulator
-/// cannot be reached or does not bring the car onto a track, and the observer's own until then.
+/// cannot be reached, does not bring the car onto a track or leaves before the first run, and the observer's own until then.
 pub fn drive(
     options: &DonkeyDriveOptions,
     driver: &mut DonkeyDriver,
@@ -74,10 +76,13 @@ pub fn drive(
         drive: DonkeyDrive::default(),
     };
     client.enter()?;
-    let driven = (0..options.runs).try_for_each(|run| client.run(run, driver));
+    let ended = (0..options.runs).try_for_each(|run| client.run(run, driver)).err();
     // The car must not go on without a driver; the simulator may be gone.
     let _ = client.link.send(&control(0.0, 0.0, 1.0));
-    Ok(DonkeyDrive { ended: driven.err(), ..client.drive })
+    match ended {
+        Some(error) if client.drive.runs.is_empty() => Err(error),
+        ended => Ok(DonkeyDrive { ended, ..client.drive }),
+    }
 }
 
 struct Client<'a> {
@@ -137,7 +142,7 @@ impl Client<'_> {
         if greeting {
             self.choose_scene()?;
         } else if let Some(scene) = &self.options.scene {
-            let scene = excerpt(scene, 40);
+            let scene = excerpt(scene, MAX_NAME_CHARS);
             self.say(format!(
                 "the simulator is in a scene already, which is driven; to drive `{scene}`, go back to its menu first"
             ))?;
@@ -157,29 +162,33 @@ impl Client<'_> {
                 ServerMessage::SceneNames(names) => Some(names),
                 _ => None,
             })?;
-        let shown = names.iter().take(MAX_NAMES).map(|name| excerpt(name, 40)).collect::<Vec<_>>().join(", ");
+        let shown =
+            names.iter().take(MAX_NAMES).map(|name| excerpt(name, MAX_NAME_CHARS)).collect::<Vec<_>>().join(", ");
         let wanted = self.options.scene.as_deref();
         let found = match wanted {
             Some(_) => names.iter().find(|name| Some(name.as_str()) == wanted),
             None => names.iter().find(|name| *name == USUAL_SCENE).or(names.first()),
         };
         let Some(name) = found else {
-            let wanted = excerpt(wanted.unwrap_or_default(), 40);
+            let wanted = excerpt(wanted.unwrap_or_default(), MAX_NAME_CHARS);
             return Err(match names.is_empty() {
                 true => self.link.error("its menu has no scenes; choose one in its window"),
                 false => Error::Usage(format!("--scene {wanted}: the simulator has no such scene; it has {shown}")),
             });
         };
         if wanted.is_none() {
-            self.say(format!("scenes of the simulator: {shown}; {} is driven, --scene chooses", excerpt(name, 40)))?;
+            self.say(format!(
+                "scenes of the simulator: {shown}; {} is driven, --scene chooses",
+                excerpt(name, MAX_NAME_CHARS)
+            ))?;
         }
         std::thread::sleep(SETTING_PAUSE);
         self.link.send(&messages::text("load_scene", &[("scene_name", name.clone())]))?;
-        let what = format!("the scene `{}` is not loaded", excerpt(name, 40));
+        let what = format!("the scene `{}` is not loaded", excerpt(name, MAX_NAME_CHARS));
         self.wait_for(LOADING_PATIENCE * self.options.patience_s, &what, |message| {
             matches!(message, ServerMessage::CarLoaded | ServerMessage::Telemetry(_)).then_some(())
         })?;
-        self.drive.scene = Some(name.clone());
+        self.drive.scene = Some(excerpt(name, MAX_NAME_CHARS));
         Ok(())
     }
 
@@ -208,6 +217,7 @@ impl Client<'_> {
 
     /// Drives the run `index`, from 0, and keeps it however it ends.
     fn run(&mut self, index: usize, driver: &mut DonkeyDriver) -> Result<()> {
+        self.drive.last_run = index + 1;
         self.put_back()?;
         let mut run = Run::new(self.options.scale, self.options.max_cte);
         let ended = self.drive_run(&mut run, index, driver);
@@ -254,9 +264,10 @@ impl Client<'_> {
             let now = Instant::now();
             let Some(telemetry) = telemetry else {
                 if now - last_telemetry > patience {
-                    let message =
-                        "no telemetry for 10 s; is the simulator paused, in its menu, or its machine overloaded?";
-                    return Err(self.link.error(message));
+                    return Err(self.link.error(format!(
+                        "no telemetry for {} s; is the simulator paused, in its menu, or its machine overloaded?",
+                        self.options.patience_s
+                    )));
                 }
                 if now - last_good > HOLD_TIME && !has_braked {
                     self.link.send(&control(steering, 0.0, 1.0))?;
@@ -303,6 +314,7 @@ impl Client<'_> {
                 Failure::Crash => "hit something",
                 Failure::LeftRoad => "left the road",
                 Failure::StoodStill => "stood still for 10 s",
+                Failure::Disqualified => "is disqualified",
             };
             self.say(format!("run {} ends after {:.1} s: the car {what}", index + 1, run.time_s()))?;
         }
@@ -312,8 +324,8 @@ impl Client<'_> {
     /// The newest telemetry; all messages that have arrived are taken notice of.
     fn newest(&mut self, run: &mut Run) -> Result<Option<Telemetry>> {
         let mut newest: Option<Telemetry> = None;
-        let mut message = self.link.receive(TICK)?;
-        for _ in 0..MAX_ARRIVED {
+        for read in 0..MAX_ARRIVED {
+            let message = if read == 0 { self.link.receive(TICK)? } else { self.link.receive_arrived()? };
             match message {
                 None => break,
                 Some(ServerMessage::Telemetry(telemetry)) => {
@@ -324,7 +336,7 @@ impl Client<'_> {
                 Some(ServerMessage::StartingLine(index)) => run.cross_line(index),
                 Some(ServerMessage::LapTime(lap_time_s)) => run.time_lap(lap_time_s),
                 Some(ServerMessage::Disqualified(why)) => {
-                    run.fail(Failure::LeftRoad);
+                    run.fail(Failure::Disqualified);
                     self.say(why.into())?;
                 }
                 Some(ServerMessage::Menu) => {
@@ -332,7 +344,6 @@ impl Client<'_> {
                 }
                 Some(_) => {}
             }
-            message = self.link.receive_arrived()?;
         }
         Ok(newest)
     }

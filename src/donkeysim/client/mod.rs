@@ -11,7 +11,7 @@ mod options;
 mod run;
 mod telemetry;
 
-pub use drive::{DonkeyFrame, drive};
+pub use drive::{DonkeyDriver, DonkeyFrame, drive};
 pub use link::MAX_MESSAGE_BYTES;
 pub use options::{CAMERA_SETTINGS, DonkeyDrive, DonkeyDriveOptions, DonkeyDriveSummary};
 pub use telemetry::{ServerMessage, Telemetry};

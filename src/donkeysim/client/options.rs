@@ -107,11 +107,13 @@ impl DonkeyDriveOptions {
 /// What was driven.
 #[derive(Debug, Default)]
 pub struct DonkeyDrive {
-    /// The scene that was chosen in the menu.
+    /// The scene that was chosen in the menu, as far as its name can be shown: a simulator may name it at any length.
     pub scene: Option<String>,
     /// The runs, the last of which may be unfinished. Times are the simulator's, distances are summed up from its speeds; places that
     /// it did not tell are no numbers.
     pub runs: Vec<Trial>,
+    /// The last run that was to be driven, from 1; if the drive ended while the car was put back for it, it is not in `runs`.
+    pub last_run: usize,
     /// Why the drive ended before its last run did, if so. What was driven until then counts.
     pub ended: Option<Error>,
     /// Telemetries that were answered.
@@ -120,7 +122,8 @@ pub struct DonkeyDrive {
     pub superseded: u64,
     /// Telemetries without a picture that can be read.
     pub unreadable: u64,
-    /// Times from the arrival of a telemetry to the control that answers it, ms.
+    /// Times from when a telemetry and all that had arrived with it is read to when the control that answers it is sent, ms. The pause
+    /// that the simulator needs between two messages, 15 ms, counts where the answer had to wait for it.
     pub answers_ms: Vec<f64>,
 }
 
@@ -143,7 +146,7 @@ pub struct DonkeyDriveSummary {
     pub completed_high: f64,
     /// Autonomy, %: 6 s are charged for each run that failed.
     pub autonomy_percent: f64,
-    /// Runs that failed: the car hit something, was too far from the line or stood still.
+    /// Runs that failed: the car hit something, was too far from the line, stood still or was disqualified.
     pub interventions: usize,
     /// The same for each km.
     pub interventions_per_km: f64,
@@ -161,6 +164,8 @@ pub struct DonkeyDriveSummary {
     pub cte_max_m: Option<f64>,
     /// Runs in which the car hit something.
     pub crashes: usize,
+    /// Runs in which the simulator disqualified the car, as for a checkpoint that it missed.
+    pub disqualified: usize,
     /// Mean speed, mph.
     pub mean_speed_mph: f64,
     /// Root mean square rate of the steering, deg/s, at 25 degrees of full lock.
@@ -218,6 +223,7 @@ impl DonkeyDriveSummary {
             cte_p95_m: line_errors.map(|errors| errors[2]),
             cte_max_m: line_errors.map(|_| runs.iter().map(|run| run.worst_cte_m).fold(0.0, f64::max)),
             crashes: failed(|failure| *failure == Failure::Crash),
+            disqualified: failed(|failure| *failure == Failure::Disqualified),
             mean_speed_mph: speeds.iter().sum::<f64>() / speeds.len().max(1) as f64,
             whiteness_deg_s: (sum(|run| run.whiteness_sum) / time_s.max(1e-9)).sqrt(),
             calm: has_direction.then(|| Calm::of(runs.iter().map(Trial::calm_frames))),

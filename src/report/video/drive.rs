@@ -129,6 +129,7 @@ fn outcome(run: &Trial, options: &TrialOptions) -> String {
         Some(Failure::Crash) => format!("hit a wall after {time_s:.1} s"),
         Some(Failure::LeftRoad) => format!("left the road after {time_s:.1} s"),
         Some(Failure::StoodStill) => format!("stood still after {time_s:.1} s"),
+        Some(Failure::Disqualified) => format!("disqualified after {time_s:.1} s"),
         None if run.laps_completed < options.laps => format!("too slow: stopped after {time_s:.1} s"),
         None if run.interventions > 0 => format!("{time_s:.1} s, put back {} times", run.interventions),
         None => {

@@ -45,7 +45,7 @@ fn full_size(car: &CarGeometry) -> CarGeometry {
 struct Lens {
     /// Focal length in pixels of the simulator's picture.
     focal_px: f64,
-    /// Rows and columns in the middle of the simulator's picture.
+    /// Rows and columns in the middle of the simulator's picture: even numbers, so that the optical axis stays in the middle.
     part: [usize; 2],
 }
 
@@ -53,7 +53,7 @@ impl Lens {
     fn of(car: &CarGeometry) -> Lens {
         let [height, width] = car.image.map(|pixels| pixels as f64);
         let per_pixel = (HEIGHT as f64 / height).min(WIDTH as f64 / width);
-        let part = [height, width].map(|side| (side * per_pixel).round().max(1.0) as usize);
+        let part = [height, width].map(|side| 2 * (side * per_pixel / 2.0).round().max(1.0) as usize);
         Lens { focal_px: car.focal_px * per_pixel, part }
     }
 
@@ -265,6 +265,31 @@ mod tests {
             (f64::from(column) - 160.0 - 0.5 * 80.0 * 4.0 / 3.0).abs() < 0.01 && (row - 80.0).abs() < 0.01,
             "{column}"
         );
+    }
+
+    #[test]
+    fn the_optical_axis_of_a_part_stays_in_its_middle() {
+        let donkey = CarGeometry::preset("donkeycar").unwrap();
+        let narrow = CarGeometry { image: [100, 31], focal_px: 100.0, ..donkey.clone() };
+        let flat = CarGeometry { image: [31, 100], focal_px: 50.0, ..donkey.clone() };
+        let track = Track::load("lake").unwrap();
+        let body = drive_expert(&track, &RecordOptions { laps: 0.01, ..Default::default() })[0].body;
+        for car in [donkey, narrow, flat] {
+            let lens = Lens::of(&car);
+            let [rows, columns] = lens.part;
+            let (top, left) = ((HEIGHT - rows) / 2, (WIDTH - columns) / 2);
+            assert_eq!([2 * top + rows, 2 * left + columns], [HEIGHT, WIDTH], "{lens:?}");
+            // A point ahead on the optical axis falls on the middle of the part.
+            let mut camera = camera(&body, Mount::Center, &car);
+            camera.focal_px = lens.focal_px as f32;
+            let (column, row) = camera.project(camera.eye + camera.forward * 10.0).unwrap();
+            let place = [row - top as f32, column - left as f32];
+            assert!((place[0] - rows as f32 / 2.0).abs() < 1e-3, "{lens:?} {place:?}");
+            assert!((place[1] - columns as f32 / 2.0).abs() < 1e-3, "{lens:?} {place:?}");
+            // Its shape is that of the car's picture.
+            let shape = columns as f64 / rows as f64 / (car.image[1] as f64 / car.image[0] as f64);
+            assert!((shape - 1.0).abs() < 0.02, "{lens:?}");
+        }
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! What one camera sees of the world: where the ground lies behind a pixel, and which colour it has.
 
-use crate::simulator::camera::pinhole::{Camera, HEIGHT, WIDTH};
+use crate::simulator::camera::pinhole::{Camera, FOCAL_PX, HEIGHT, WIDTH};
 use crate::simulator::math::Vec3;
 use crate::simulator::scenery::light::Variant;
 use crate::simulator::scenery::road_texture::{ACROSS_UNITS, ACROSS_UNITS_PER_M, ALONG_UNITS_PER_M, HALF_M, Level};
@@ -17,6 +17,9 @@ pub(super) const ANCHORS: usize = WIDTH / SPAN + 1;
 const MAX_DISTANCE_M: f32 = 380.0;
 /// Up to this distance the light on the road is interpolated; beyond it, the nearest texel of the map gives the light, m.
 const SMOOTH_LIGHT_M: f32 = 45.0;
+
+/// Pixels of the own lens for a whole turn along the sky. In the middle of the picture they are 2 pi FOCAL_PX = 871, at its sides more.
+const TURN_PX: f32 = 900.0;
 
 /// Red and blue of a packed colour.
 const RED_BLUE: u32 = 0x00ff_00ff;
@@ -355,7 +358,9 @@ impl View<'_> {
             };
             let Some(hit) = hit else {
                 *depth = 0.0;
-                let turn = self.columns[k].turn - i as f32 * AROUND as f32 / 900.0;
+                // Exactly 1 for the own lens.
+                let finer = FOCAL_PX / self.camera.focal_px;
+                let turn = self.columns[k].turn - i as f32 * AROUND as f32 / TURN_PX * finer;
                 self.put_sky(SkyPlace::new(turn, ray.z * level), out);
                 continue;
             };

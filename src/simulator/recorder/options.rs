@@ -134,8 +134,12 @@ pub struct RecordingInfo {
     pub recovery: bool,
     /// `smooth` or `keyboard`; `manual` if a person drove.
     pub style: String,
-    /// Speed held, mph; the highest, if by hand.
+    /// Speed held, mph, on the full-size track; the highest, if by hand.
     pub speed_mph: f64,
+    /// How many times larger the track is than the model of it on which a small car drove. Speeds in the log are those of the car, divided
+    /// by this.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub scale: Option<f64>,
     /// Driven slower than that before and in bends, so that the car was pushed sideways by at most this, m/s².
     #[serde(skip_serializing_if = "Option::is_none")]
     pub bends_mps2: Option<f64>,
@@ -162,6 +166,7 @@ impl RecordingInfo {
             recovery: options.recovery,
             style: if options.style == Style::Keyboard { "keyboard" } else { "smooth" }.to_string(),
             speed_mph: options.speed_mph,
+            scale: options.car.as_ref().map(foreign_car::scale).filter(|scale| *scale != 1.0),
             bends_mps2: options.bends_mps2,
             label_ahead_m: options.label_ahead_m,
             noise: options.noise,

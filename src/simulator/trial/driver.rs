@@ -51,7 +51,8 @@ pub trait Driver {
     }
 }
 
-/// A driver that looks through the camera of another car. Steering is that car's.
+/// A driver that looks through the camera of another car. Steering is that car's, and so is a speed that the driver wants: a small car
+/// drives it on a model of the track, as recordings of it hold it.
 pub struct InCar<D> {
     /// The driver.
     pub driver: D,
@@ -66,7 +67,11 @@ impl<D: Driver> Driver for InCar<D> {
 
     fn drive(&mut self, frame: &RgbFrame, state: &DriveState) -> DriverAnswer {
         let answer = self.driver.drive(frame, state);
-        DriverAnswer { steering: foreign_car::steering_of(f64::from(answer.steering), &self.car) as f32, ..answer }
+        let pace = answer.pace.map(|pace| match pace {
+            Pace::SpeedMph(speed_mph) => Pace::SpeedMph(speed_mph * foreign_car::scale(&self.car) as f32),
+            Pace::Throttle(throttle) => Pace::Throttle(throttle),
+        });
+        DriverAnswer { steering: foreign_car::steering_of(f64::from(answer.steering), &self.car) as f32, pace }
     }
 
     fn car(&self) -> Option<&CarGeometry> {
@@ -110,5 +115,47 @@ impl Driver for Zero {
 
     fn needs_frame(&self) -> bool {
         false
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::simulator::Track;
+    use crate::simulator::car::simulation::Start;
+
+    /// Answers with the steering and the pace of a log's row.
+    struct Row(DriverAnswer);
+
+    impl Driver for Row {
+        fn steer(&mut self, _: &RgbFrame, _: &DriveState) -> f32 {
+            self.0.steering
+        }
+
+        fn drive(&mut self, _: &RgbFrame, _: &DriveState) -> DriverAnswer {
+            self.0
+        }
+    }
+
+    #[test]
+    fn what_a_recording_of_another_car_holds_drives_the_own_car_as_it_was_driven() {
+        let track = Track::load("lake").unwrap();
+        let start = Start { s_m: 0.0, reverse: false, offset_m: 0.0, heading_deg: 0.0 };
+        let simulation = Simulation::new(&track, start, 0.0);
+        let state = DriveState { simulation: &simulation, speed_mph: 0.0 };
+        for name in ["donkeycar", "steersman"] {
+            let car = CarGeometry::preset(name).unwrap();
+            // As the recorder writes it of 20 mph.
+            let row = Row(DriverAnswer {
+                steering: foreign_car::steering(0.3, &car) as f32,
+                pace: Some(Pace::SpeedMph((20.0 / foreign_car::scale(&car)) as f32)),
+            });
+            let answer = InCar { driver: row, car: car.clone() }.drive(&RgbFrame::default(), &state);
+            let Some(Pace::SpeedMph(speed_mph)) = answer.pace else { panic!("{answer:?}") };
+            assert!((speed_mph - 20.0).abs() < 1e-4 && (answer.steering - 0.3).abs() < 1e-6, "{name}: {answer:?}");
+            let throttle = Row(DriverAnswer { steering: 0.0, pace: Some(Pace::Throttle(0.4)) });
+            let answer = InCar { driver: throttle, car }.drive(&RgbFrame::default(), &state);
+            assert_eq!(answer.pace, Some(Pace::Throttle(0.4)), "{name}");
+        }
     }
 }

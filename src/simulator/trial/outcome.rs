@@ -22,6 +22,8 @@ pub enum Failure {
     LeftRoad,
     /// Stood still for more than 10 s.
     StoodStill,
+    /// Disqualified from a race, which only other simulators do.
+    Disqualified,
 }
 
 /// The state of a trial at one frame.
