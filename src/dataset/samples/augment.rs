@@ -4,6 +4,7 @@
 //! They act on the RGB stage of preprocessing (cropped, before the colour conversion), in this order: view, shift, shadows,
 //! lines, colours, brightness, block noise. Each is drawn anew for every sample and epoch.
 
+use super::noise::{block_noise, pixel_noise};
 use super::spec::Correction;
 use crate::dataset::pictures::preprocess::Preprocessing;
 use crate::engine::random::{below, uniform, unit};
@@ -262,40 +263,6 @@ fn factors(factor: f64) -> [u8; 256] {
     std::array::from_fn(|grey| (grey as f64 * factor).round().min(255.0) as u8)
 }
 
-/// Adds an error to each block of `block` (height, width) pixels: constant, and a half wave along each axis, each of up to `amplitude`
-/// grey levels.
-fn block_noise(rgb: &mut [u8], width: usize, block: [usize; 2], amplitude: f64, rng: &mut impl Rng) {
-    let rows = rgb.len() / (width * 3);
-    let wave = |at: usize, side: usize| (std::f64::consts::PI * (at as f64 + 0.5) / side as f64).cos();
-    for top in (0..rows).step_by(block[0]) {
-        for left in (0..width).step_by(block[1]) {
-            let [constant, down, along] = [(); 3].map(|()| uniform(rng, -amplitude, amplitude));
-            for y in top..rows.min(top + block[0]) {
-                let of_row = constant + down * wave(y - top, block[0]);
-                for x in left..width.min(left + block[1]) {
-                    // Half a grey level more, as the conversion to bytes cuts off.
-                    let error = (of_row + along * wave(x - left, block[1]) + 0.5) as f32;
-                    for grey in &mut rgb[(y * width + x) * 3..][..3] {
-                        *grey = (f32::from(*grey) + error) as u8;
-                    }
-                }
-            }
-        }
-    }
-}
-
-/// Adds an error of up to `amplitude` grey levels to each grey level.
-fn pixel_noise(rgb: &mut [u8], amplitude: f64, rng: &mut impl Rng) {
-    // A random byte for each grey level, [-127, 127] / 127 of the amplitude, which counts in 1/256 of a grey level.
-    let step = (amplitude * 256.0 / 127.0).round() as i32;
-    for greys in rgb.chunks_mut(8) {
-        for (grey, random) in greys.iter_mut().zip(rng.next_u64().to_le_bytes()) {
-            let error = (i32::from(random as i8).max(-127) * step + 128) >> 8;
-            *grey = (i32::from(*grey) + error).clamp(0, 255) as u8;
-        }
-    }
-}
-
 /// Moves the picture `columns` to the right (to the left if negative) and repeats the edge column.
 fn shift(rgb: &mut [u8], width: usize, columns: isize) {
     let by = columns.unsigned_abs().min(width - 1);
@@ -533,72 +500,6 @@ mod tests {
         assert!(reaches(|o| o.right_m) > 0.98 && reaches(|o| -o.turn) > 0.1);
         let always: ViewSpec = toml::from_str("offset_m = 1.0\nturn_deg = 6.0").unwrap();
         assert!((0..100).all(|stream| always.draw(&mut rng(3, Purpose::View, 0, stream)).is_some()));
-    }
-
-    #[test]
-    fn pixel_noise_is_fresh_for_each_grey_level_and_has_the_amplitude_that_was_asked_for() {
-        let noise: Augmentation = toml::from_str("pixel_noise = 20").unwrap();
-        let preprocessing = Preprocessing { source: [80, 160], rows: [0, 80], resize: [40, 80], ..Default::default() };
-        let mut widest = 0.0_f64;
-        for stream in 0..50 {
-            let mut rgb = vec![128; 40 * 80 * 3];
-            assert_eq!(noise.apply(&preprocessing, &mut rgb, &mut rng(1, Purpose::Test, 0, stream)), 0.0);
-            let errors: Vec<f64> = rgb.iter().map(|grey| f64::from(*grey) - 128.0).collect();
-            let count = errors.len() as f64;
-            let square = errors.iter().map(|e| e * e).sum::<f64>() / count;
-            let largest = errors.iter().fold(0.0, |a: f64, e| a.max(e.abs()));
-            assert!(largest <= 20.0 && errors.iter().sum::<f64>().abs() / count < 0.5);
-            // Evenly spread errors: the mean square is a third of that of the amplitude. Neighbours in channel, row and column know
-            // nothing of each other.
-            assert!((square / (largest * largest) - 1.0 / 3.0).abs() < 0.1 || largest < 4.0, "{square} {largest}");
-            for apart in [1, 3, 240] {
-                let together = errors.iter().zip(&errors[apart..]).map(|(a, b)| a * b).sum::<f64>() / count;
-                assert!(together.abs() <= 0.06 * square, "{apart}: {together} of {square}");
-            }
-            widest = widest.max(largest);
-        }
-        assert!(widest > 17.0, "{widest}");
-        assert!(
-            Augmentation { pixel_noise: 65.0, ..noise }.validate().unwrap_err().to_string().contains("pixel_noise")
-        );
-        let mut limits = [0u8, 255].repeat(300);
-        pixel_noise(&mut limits, 64.0, &mut rng(1, Purpose::Test, 0, 0));
-        assert!(
-            limits.iter().step_by(2).all(|grey| *grey <= 64)
-                && limits.iter().skip(1).step_by(2).all(|grey| *grey >= 191)
-        );
-    }
-
-    #[test]
-    fn block_noise_is_grey_changes_from_block_to_block_and_has_the_amplitude_that_was_asked_for() {
-        // Blocks of 8x8 source pixels are 4x4 pixels of the stage.
-        let preprocessing = Preprocessing { source: [16, 40], rows: [0, 16], resize: [8, 20], ..Default::default() };
-        let noise: Augmentation = toml::from_str("block_noise = 6").unwrap();
-        assert!(noise.is_active() && noise.validate().is_ok());
-        let (mut sum, mut largest, mut count) = (0.0, 0.0f64, 0);
-        for stream in 0..500 {
-            let mut rgb = vec![100; 8 * 20 * 3];
-            assert_eq!(noise.apply(&preprocessing, &mut rgb, &mut rng(5, Purpose::Test, 0, stream)), 0.0);
-            for (k, px) in rgb.chunks_exact(3).enumerate() {
-                assert!(px[0] == px[1] && px[1] == px[2], "brightness alone");
-                let error = f64::from(px[0]) - 100.0;
-                (sum, largest, count) = (sum + error, largest.max(error.abs()), count + 1);
-                // Within a block neighbours in a row differ by at most 2 cos(3 pi/8) = 0.77 of the amplitude, and by rounding.
-                if k % 4 > 0 {
-                    assert!((f64::from(px[0]) - f64::from(rgb[3 * k - 3])).abs() <= 6.0 * 0.77 + 1.0);
-                }
-            }
-        }
-        assert!((sum / f64::from(count)).abs() < 0.1, "no brighter, no darker on average");
-        // Up to 6 · (1 + 2 cos(pi/8)) grey levels, where all three errors are as large as can be.
-        assert!((8.0..=18.0).contains(&largest), "{largest}");
-        assert!(
-            Augmentation { block_noise: -1.0, ..noise }.validate().unwrap_err().to_string().contains("block_noise")
-        );
-        // Black and white are held.
-        let mut rgb = [0, 255].repeat(12);
-        block_noise(&mut rgb, 4, [4, 4], 60.0, &mut rng(1, Purpose::Test, 0, 0));
-        assert!(rgb.contains(&0) || rgb.contains(&255));
     }
 
     #[test]
