@@ -2,7 +2,7 @@
 //!
 //! Valid files of every format are damaged at random, from a seed, and read. Each format is read for some tenths of a second;
 //! `STEERSMAN_FUZZ_SECONDS=300 cargo test --release --test hostile_files -- --nocapture` takes 300 s for each, and prints a table.
-//! `STEERSMAN_FUZZ_SEED=…` begins elsewhere. A failure names its seed, and repeats with it.
+//! `STEERSMAN_FUZZ_ONLY=keras2` leaves out those whose name in the table is another, `STEERSMAN_FUZZ_SEED=…` begins elsewhere. A failure names its seed, and repeats with it.
 
 mod common;
 

@@ -113,7 +113,8 @@ pub struct Hammer {
 }
 
 impl Hammer {
-    /// Reads damaged versions of `original` for `seconds`, or for `STEERSMAN_FUZZ_SECONDS`, and prints what happened.
+    /// Reads damaged versions of `original` for `seconds`, or for `STEERSMAN_FUZZ_SECONDS`, and prints what happened; nothing if `name` does
+    /// not contain `STEERSMAN_FUZZ_ONLY`.
     ///
     /// # Panics
     ///
@@ -126,6 +127,9 @@ impl Hammer {
         damage: impl Fn(&mut ChaCha8Rng, &mut T),
         read: impl Fn(&T) -> Result<(), String>,
     ) {
+        if std::env::var("STEERSMAN_FUZZ_ONLY").is_ok_and(|only| !name.contains(&only)) {
+            return;
+        }
         let seconds = number("STEERSMAN_FUZZ_SECONDS", seconds);
         let first = number("STEERSMAN_FUZZ_SEED", 1u64);
         let (mut accepted, mut refused, mut slowest) = (0, 0, Duration::ZERO);
