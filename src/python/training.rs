@@ -58,7 +58,7 @@ pub(super) fn train(
                 simulator_set(RECORDINGS.as_ref(), &takes, &of_user, &said, reporter, &stop)?
             }
             None => {
-                recipe.labels.notice_without_expert().into_iter().for_each(|notice| reporter.notice(notice.into()));
+                recipe.labels.notice_without_expert().into_iter().for_each(|notice| reporter.notice(notice));
                 Vec::new()
             }
         };
