@@ -1,38 +1,16 @@
 //! Our simulator in the place of DonkeySim, with the messages that the client of `gym_donkeycar` sends: bare JSON, all values strings.
 
+#[path = "common/stand_in.rs"]
+mod stand_in;
+
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{SocketAddr, TcpStream};
 use std::time::Duration;
 
 use serde_json::Value;
-use steersman::donkeysim::{DonkeySimOptions, DonkeySimServer, Reading, Scene};
-use steersman::observer::StopSignal;
-use steersman::simulator::Track;
+use steersman::donkeysim::{Reading, Scene};
 
-/// Runs `test` against a server; the notices to its user are the result.
-fn with_server(scene: Scene, reading: Reading, test: impl FnOnce(SocketAddr)) -> Vec<String> {
-    let address = SocketAddr::from(([127, 0, 0, 1], 0));
-    let server = DonkeySimServer::bind(DonkeySimOptions { address, scene, reading, seed: 1, car: None }).unwrap();
-    let (address, stop, track) = (server.address().unwrap(), StopSignal::default(), Track::load("lake").unwrap());
-    let mut said = Vec::new();
-    std::thread::scope(|scope| {
-        let (said, stop, track) = (&mut said, &stop, &track);
-        let running = scope.spawn(move || {
-            let mut say = |text: String| {
-                said.push(text);
-                Ok(())
-            };
-            server.run(track, &mut say, stop).unwrap()
-        });
-        let tested = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| test(address)));
-        stop.request();
-        running.join().unwrap();
-        if let Err(panic) = tested {
-            std::panic::resume_unwind(panic);
-        }
-    });
-    said
-}
+use stand_in::with_stand_in;
 
 struct Client {
     stream: TcpStream,
@@ -86,7 +64,7 @@ fn number(message: &Value, name: &str) -> f64 {
 
 #[test]
 fn a_client_goes_from_the_menu_onto_the_track_and_drives() {
-    with_server(Scene::Menu, Reading::Lenient, |address| {
+    with_stand_in(Scene::Menu, Reading::Lenient, |address| {
         let mut client = Client::connect(address);
         assert_eq!(client.receive()["msg_type"], "scene_selection_ready");
         client.send(r#"{"msg_type": "get_scene_names"}"#);
@@ -130,7 +108,7 @@ fn a_client_goes_from_the_menu_onto_the_track_and_drives() {
 
 #[test]
 fn a_race_scene_sends_pictures_to_whoever_connects() {
-    with_server(Scene::Race, Reading::Lenient, |address| {
+    with_stand_in(Scene::Race, Reading::Lenient, |address| {
         let mut clients = [Client::connect(address), Client::connect(address)];
         for client in &mut clients {
             assert_eq!(client.receive()["msg_type"], "car_loaded");
@@ -146,7 +124,7 @@ fn a_race_scene_sends_pictures_to_whoever_connects() {
 
 #[test]
 fn the_strict_mode_wants_strings_and_one_message_a_write() {
-    let said = with_server(Scene::Race, Reading::Strict, |address| {
+    let said = with_stand_in(Scene::Race, Reading::Strict, |address| {
         let mut client = Client::connect(address);
         client.wait_for("telemetry");
         client.send(r#"{"msg_type": "control", "steering": 0.5, "throttle": 1.0}"#);
@@ -164,7 +142,7 @@ fn the_strict_mode_wants_strings_and_one_message_a_write() {
 
 #[test]
 fn hostile_clients_harm_neither_the_server_nor_others() {
-    let said = with_server(Scene::Race, Reading::Lenient, |address| {
+    let said = with_stand_in(Scene::Race, Reading::Lenient, |address| {
         let mut honest = Client::connect(address);
         honest.wait_for("telemetry");
         let attacks: [Vec<u8>; 7] = [

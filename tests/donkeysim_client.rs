@@ -1,22 +1,25 @@
 //! The client of DonkeySim: against our stand-in as strict as the real one, against a simulator that a test plays, and against hostile ones.
 
 mod common;
+#[path = "common/stand_in.rs"]
+mod stand_in;
 
 use std::io::{Read, Write};
-use std::net::{SocketAddr, TcpListener, TcpStream};
+use std::net::{TcpListener, TcpStream};
 use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
 use steersman::Error;
 use steersman::donkeysim::client::{DonkeyDrive, DonkeyDriveOptions, DonkeyDriveSummary, DonkeyFrame, drive};
-use steersman::donkeysim::{DonkeySimOptions, DonkeySimServer, Reading, Scene};
+use steersman::donkeysim::{Reading, Scene};
 use steersman::observer::StopSignal;
 use steersman::pilot::Pilot;
-use steersman::simulator::{DriverAnswer, Failure, Pace, Speed, Track};
+use steersman::simulator::{DriverAnswer, Failure, Pace, Speed};
 use steersman::simulator_client::ClientEvent;
 
 use common::command::{error, json as run_json, steersman};
 use common::served::random_model;
+use stand_in::with_stand_in;
 
 /// A picture of 160x120 pixels in one grey.
 fn jpeg() -> Vec<u8> {
@@ -46,35 +49,9 @@ fn straight(_: DonkeyFrame) -> Result<DriverAnswer, String> {
     Ok(DriverAnswer { steering: 0.0, pace: None })
 }
 
-/// Runs `test` against our stand-in; the notices to the user of the stand-in are the result.
-fn with_stand_in(scene: Scene, test: impl FnOnce(SocketAddr)) -> Vec<String> {
-    let address = SocketAddr::from(([127, 0, 0, 1], 0));
-    let options = DonkeySimOptions { address, scene, reading: Reading::Strict, seed: 1, car: None };
-    let server = DonkeySimServer::bind(options).unwrap();
-    let (address, stop, track) = (server.address().unwrap(), StopSignal::default(), Track::load("lake").unwrap());
-    let mut said = Vec::new();
-    std::thread::scope(|scope| {
-        let (said, stop, track) = (&mut said, &stop, &track);
-        let running = scope.spawn(move || {
-            let mut say = |text: String| {
-                said.push(text);
-                Ok(())
-            };
-            server.run(track, &mut say, stop).unwrap()
-        });
-        let tested = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| test(address)));
-        stop.request();
-        running.join().unwrap();
-        if let Err(panic) = tested {
-            std::panic::resume_unwind(panic);
-        }
-    });
-    said
-}
-
 #[test]
 fn it_drives_our_stand_in_from_the_menu_in_its_strict_mode() {
-    let said_there = with_stand_in(Scene::Menu, |address| {
+    let said_there = with_stand_in(Scene::Menu, Reading::Strict, |address| {
         let options = DonkeyDriveOptions {
             server: address.to_string(),
             picture: [48, 64],
@@ -120,13 +97,13 @@ fn it_drives_our_stand_in_from_the_menu_in_its_strict_mode() {
 
 #[test]
 fn a_scene_that_is_not_there_is_refused_with_those_that_are() {
-    with_stand_in(Scene::Menu, |address| {
+    with_stand_in(Scene::Menu, Reading::Strict, |address| {
         let scene = Some("moon\u{1b}[2J".to_string());
         let options = DonkeyDriveOptions { server: address.to_string(), scene, ..DonkeyDriveOptions::default() };
         let message = go(&options, straight).0.unwrap_err().to_string();
         assert!(message.contains("it has generated_road") && message.contains("moon\\u{1b}"), "{message}");
     });
-    with_stand_in(Scene::Race, |address| {
+    with_stand_in(Scene::Race, Reading::Strict, |address| {
         let options = DonkeyDriveOptions {
             server: address.to_string(),
             scene: Some("warehouse".into()),
@@ -449,7 +426,7 @@ fn as_a_command_it_saves_and_tells_and_an_error_has_its_remedy() {
             steersman(folder.path()).args(["drive", "model", "--donkeysim", &nobody]).args(wrong).output().unwrap();
         assert_eq!(output.status.code(), Some(2), "{wrong:?}");
     }
-    with_stand_in(Scene::Race, |address| {
+    with_stand_in(Scene::Race, Reading::Strict, |address| {
         let address = address.to_string();
         let args = ["drive", "model", "--donkeysim", &address, "--time-limit", "3", "--out", "drive", "--json"];
         let told = run_json(folder.path(), &args);

@@ -125,7 +125,8 @@ fn object(bytes: &[u8]) -> Result<Option<std::ops::Range<usize>>, String> {
     Ok(None)
 }
 
-fn shown(bytes: &[u8]) -> String {
+/// The beginning of a message, fit for a terminal.
+pub(super) fn shown(bytes: &[u8]) -> String {
     excerpt(&String::from_utf8_lossy(&bytes[..bytes.len().min(200)]), 60)
 }
 

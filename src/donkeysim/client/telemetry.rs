@@ -6,7 +6,7 @@ use std::fmt;
 use serde::Deserialize;
 use serde::de::{Deserializer, IgnoredAny, MapAccess, SeqAccess, Visitor};
 
-use crate::text::excerpt;
+use crate::donkeysim::messages::shown;
 
 /// A message of the simulator.
 #[derive(Clone, Debug, PartialEq)]
@@ -169,10 +169,6 @@ fn parse_repaired(line: &[u8]) -> Result<ServerMessage, String> {
     let repaired = with_decimal_points(line);
     let fields = serde_json::from_slice(&repaired).ok();
     fields.as_ref().and_then(message).ok_or_else(|| format!("text that is no message: {}", shown(line)))
-}
-
-fn shown(bytes: &[u8]) -> String {
-    excerpt(&String::from_utf8_lossy(&bytes[..bytes.len().min(200)]), 60)
 }
 
 fn message(fields: &Fields) -> Option<ServerMessage> {
