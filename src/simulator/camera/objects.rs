@@ -41,7 +41,7 @@ fn draw_sprite(depths: &mut [f32], view: &View, sprite: &Sprite, frame: &mut Rgb
     if top >= bottom || high < 0.7 {
         return;
     }
-    let level = picture.level(high);
+    let level = picture.level(high, wide);
     let (w, h) = (level.width, level.height);
     let light = (sprite.light * 256.0).min(256.0) as u32;
     let (inverse, air) = (1.0 / foot.z, view.air(foot.z));

@@ -141,7 +141,7 @@ impl Renderer {
                         levels = view.levels(a, (below[k] - a.inverse).abs());
                         known = *a;
                     }
-                    view.shade_span(a, b, lap, &levels, out, depth);
+                    view.shade_span(row, a, b, lap, &levels, out, depth);
                 } else {
                     view.shade_each(row, k, &depths_below[k], out, depth);
                 }
