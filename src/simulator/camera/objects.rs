@@ -16,6 +16,7 @@ const MAX_DISTANCE_M: f32 = 330.0;
 const FRACTION_BITS: u32 = 14;
 
 /// Draws walls and sprites over the ground of `frame`.
+#[inline(never)]
 pub(crate) fn draw(depths: &mut [f32], view: &View, frame: &mut RgbFrame) {
     for piece in &view.world.walls {
         draw_wall(depths, view, piece, frame);

@@ -240,6 +240,7 @@ impl View<'_> {
     }
 
     /// Shades eight pixels between two marched columns.
+    #[inline(always)]
     pub(super) fn shade_span(
         &self,
         row: usize,

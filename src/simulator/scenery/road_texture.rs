@@ -269,7 +269,7 @@ fn surface(look: &Look, along: f32, across: f32, seed: u32) -> [f32; 3] {
     let medium = grain(along, across, 0.35, 2.0, seed + 11);
     let large = grain(along, across, 2.0, 3.0, seed + 12);
     // Light stones between dark ones.
-    let stones = 1.1 * fine + 1.6 * (fine - 0.2).max(0.0);
+    let stones = 1.1 * fine + 0.9 * (fine - 0.2).max(0.0);
     let plain = 1.0 + look.grain * (stones + 0.2 * medium) + 0.18 * large;
     match look.surface {
         Surface::Asphalt => scaled(look.tone, plain),
