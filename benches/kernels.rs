@@ -8,13 +8,14 @@ use criterion::measurement::WallTime;
 use criterion::{BenchmarkGroup, Criterion, Throughput, criterion_group, criterion_main};
 use std::hint::black_box;
 use std::time::{Duration, Instant};
-use steersman_kernels::conv::{Conv, ConvAlgorithm, ConvShape};
+use steersman_kernels::conv::{Conv, ConvAlgorithm, ConvShape, PooledConv};
 use steersman_kernels::gemm::{gemm, gemm_scratch_len};
 use steersman_kernels::matrix::{Matrix, MatrixMut};
 use steersman_kernels::norm_rectify::{self, ChannelMeans, ChannelStatistics, RectifyShape, Slopes};
-use steersman_kernels::pool::PoolShape;
+
+use steersman_kernels::pool::{self, PoolShape};
 use steersman_kernels::sgemm::sgemm;
-use steersman_kernels::{Backend, Isa, activation, norm, peak, pool, update};
+use steersman_kernels::{Backend, Isa, activation, norm, peak, update};
 
 /// Images in a call: one shard of a training batch.
 const IMAGES: usize = 8;
@@ -100,8 +101,9 @@ fn convolutions(criterion: &mut Criterion) {
         });
         // As in a training step, where weights are packed once for all shards.
         for conv in [Conv::new(shape, isa), Conv::new(shape, Backend { isa, conv: ConvAlgorithm::Im2col })] {
-            let name =
-                |pass: &str| format!("{pass}{}", if conv.algorithm() == ConvAlgorithm::Auto { "" } else { ", im2col" });
+            let name = |pass: &str| {
+                format!("{pass}{}", if conv.backend().conv == ConvAlgorithm::Auto { "" } else { ", im2col" })
+            };
             let mut scratch = vec![0.0; conv.scratch_len()];
             let (mut packed, mut packed_gradient) =
                 (vec![0.0; conv.packed_len()], vec![0.0; conv.packed_gradient_len()]);
@@ -187,7 +189,7 @@ fn rectified(criterion: &mut Criterion) {
     }
 }
 
-/// A convolution behind a 4x4 pooling: the pooling with its argmax, and the gradients from those alone.
+/// A convolution before a 4x4 pooling: forward with the pooling, and the gradients from the maxima alone.
 fn pooled_convolutions(criterion: &mut Criterion) {
     let isa = Isa::best();
     let peak = peak::measure_peak_gflops(isa, 0.5);
@@ -195,27 +197,24 @@ fn pooled_convolutions(criterion: &mut Criterion) {
         let [pad_top, pad_bottom, pad_left, pad_right] = [0; 4];
         let (kh, kw, stride_h, stride_w) = (kernel, kernel, 1, 1);
         let shape = ConvShape { c, h, w, oc, kh, kw, stride_h, stride_w, pad_top, pad_bottom, pad_left, pad_right };
-        let pool_shape =
-            PoolShape { c: oc, h: shape.out_h(), w: shape.out_w(), kh: 4, kw: 4, stride_h: 4, stride_w: 4 };
-        let conv = Conv::new(shape, isa);
-        let map: Vec<f32> =
-            (0..IMAGES * oc * shape.out_h() * shape.out_w()).map(|i| (i * 7919 % 1000) as f32).collect();
-        let pooled = IMAGES * oc * pool_shape.out_h() * pool_shape.out_w();
+        let conv = PooledConv::new(shape, isa).expect("lenet's convolutions have the pass");
+        let pooled = IMAGES * conv.y_len();
         let (mut y, mut argmax, dy) = (vec![0.0; pooled], vec![0; pooled], vec![0.5; pooled]);
         let (x, weight) = (vec![0.5; IMAGES * c * h * w], vec![0.1; oc * c * kh * kw]);
         let (mut dx, mut dweight, mut dbias) = (x.clone(), weight.clone(), vec![0.0; oc]);
+        let (mut packed, mut scratch) = (vec![0.0; conv.packed_len()], vec![0.0; conv.scratch_len()]);
+        conv.pack(&weight, &dbias, &mut packed);
         let mut group = criterion.benchmark_group(format!("pooled conv {name}"));
-        group.throughput(Throughput::Bytes(4 * (map.len() + 2 * pooled) as u64));
-        group.bench_function("max_forward_with_argmax", |b| {
-            b.iter(|| pool::max_forward_with_argmax(isa, &pool_shape, IMAGES, w, black_box(&map), &mut y, &mut argmax));
+        product(&mut group, "forward", 2 * IMAGES as u64 * shape.multiply_adds(), peak, || {
+            conv.forward(IMAGES, black_box(&x), &packed, &mut y, &mut argmax, &mut scratch);
         });
         // Of the positions that have a gradient: a 16th of all.
         let operations = 2 * (pooled * c * kh * kw) as u64;
-        product(&mut group, "sparse_backward_weight", operations, peak, || {
-            conv.sparse_backward_weight(IMAGES, black_box(&x), &argmax, &dy, &mut dweight, &mut dbias);
+        product(&mut group, "backward_weight", operations, peak, || {
+            conv.backward_weight(IMAGES, black_box(&x), &argmax, &dy, &mut dweight, &mut dbias);
         });
-        product(&mut group, "sparse_backward_input", operations, peak, || {
-            conv.sparse_backward_input(IMAGES, &argmax, black_box(&dy), &weight, &mut dx);
+        product(&mut group, "backward_input", operations, peak, || {
+            conv.backward_input(IMAGES, &argmax, black_box(&dy), &weight, &mut dx);
         });
         group.finish();
     }

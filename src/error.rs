@@ -68,6 +68,9 @@ pub enum Error {
     /// The server that this program connects to is gone, or does not reply.
     #[error("{0}")]
     Connection(String),
+    /// Another process that works together with this one could not go on.
+    #[error("{0}")]
+    Rank(String),
     /// The operating system refused a port, a thread or a signal handler. The message has the remedy.
     #[error("{0}")]
     System(String),

@@ -170,6 +170,8 @@
 pub mod calm;
 #[cfg(feature = "cli")]
 pub mod cli;
+#[cfg(feature = "training")]
+pub mod cluster;
 #[cfg(feature = "live")]
 pub mod coach;
 #[cfg(feature = "training")]

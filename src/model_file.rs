@@ -198,6 +198,15 @@ pub(crate) fn tensors_of(network: &Network, parameters: &Parameters) -> Vec<Stor
 
 /// Writes a safetensors file, in whole or not at all.
 pub(crate) fn write_tensors(path: &Path, tensors: &[StoredTensor], metadata: String) -> Result<()> {
+    atomic_file::write(path, &tensor_bytes(path, tensors, metadata)?)
+}
+
+/// The bytes of a safetensors file `path` of ours.
+///
+/// # Errors
+///
+/// [`Error::Data`] if the format cannot hold them.
+pub(crate) fn tensor_bytes(path: &Path, tensors: &[StoredTensor], metadata: String) -> Result<Vec<u8>> {
     let views = tensors.iter().map(|tensor| {
         let view = TensorView::new(tensor.dtype, tensor.shape.clone(), &tensor.bytes);
         (tensor.name.as_str(), view.expect("a stored tensor has as many bytes as its shape says"))
@@ -206,8 +215,7 @@ pub(crate) fn write_tensors(path: &Path, tensors: &[StoredTensor], metadata: Str
         sealed(metadata, tensors.iter().map(|tensor| (&*tensor.name, tensor.dtype, &*tensor.shape, &*tensor.bytes)));
     // One entry only: the order of several would be that of a hash map, and the same model another file each time.
     let info = HashMap::from([(METADATA_KEY.to_string(), metadata)]);
-    let bytes = safetensors::serialize(views, Some(info)).map_err(|e| Error::data(path, e.to_string()))?;
-    atomic_file::write(path, &bytes)
+    safetensors::serialize(views, Some(info)).map_err(|e| Error::data(path, e.to_string()))
 }
 
 /// Tensors and metadata of a safetensors file of ours.

@@ -1,11 +1,13 @@
 //! What a planned network promises: no allocation in the steady state, the same bits for any number of threads and any
 //! capacity of the plan, and an evaluation that changes nothing.
 
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Arc, Barrier, Mutex, PoisonError};
 
 use ndarray::{Array1, ArrayView1, ArrayView4, Axis};
 use steersman::engine::loss::{Loss, PairTerms, Pairs, Smoothness};
-use steersman::engine::network::{InferencePlan, LayerSpec, Network, Parameters, Predictor, StepInput, TrainingPlan};
+use steersman::engine::network::{
+    InferencePlan, LayerSpec, Network, Parameters, Predictor, Ranks, StepInput, TrainingPlan, share,
+};
 use steersman::engine::optimizer::{AveragingSpec, Optimizer, WeightAverage};
 use steersman::engine::random::{Purpose, rng, uniform};
 use steersman::engine::tensor::Shape;
@@ -184,6 +186,116 @@ fn training_gives_the_same_bits_for_any_number_of_threads_and_any_capacity() {
     }
 }
 
+/// Ranks that are threads of this process: what they send lies on a table, for all to read between two meetings.
+#[derive(Debug)]
+struct ThreadRanks {
+    rank: usize,
+    table: Arc<Table>,
+}
+
+#[derive(Debug)]
+struct Table {
+    meeting: Barrier,
+    /// For each rank, what it sends to each rank.
+    sent: Vec<Mutex<Vec<Vec<f64>>>>,
+}
+
+impl ThreadRanks {
+    fn table(size: usize) -> Arc<Table> {
+        Arc::new(Table { meeting: Barrier::new(size), sent: (0..size).map(|_| Mutex::default()).collect() })
+    }
+
+    /// What each rank sends to this one, one after the other.
+    fn exchange(&self, send: Vec<Vec<f64>>, counts: &[usize]) -> Vec<f64> {
+        *self.table.sent[self.rank].lock().unwrap() = send;
+        self.table.meeting.wait();
+        let from = self.table.sent.iter().map(|sent| sent.lock().unwrap()[self.rank].clone());
+        let received: Vec<Vec<f64>> = from.collect();
+        self.table.meeting.wait();
+        assert_eq!(received.iter().map(Vec::len).collect::<Vec<_>>(), counts);
+        received.concat()
+    }
+}
+
+fn singles(doubles: Vec<f64>, to: &mut [f32]) {
+    to.copy_from_slice(&doubles.iter().map(|x| *x as f32).collect::<Vec<_>>());
+}
+
+impl Ranks for ThreadRanks {
+    fn rank(&self) -> usize {
+        self.rank
+    }
+
+    fn size(&self) -> usize {
+        self.table.sent.len()
+    }
+
+    fn gather_f64(&self, mine: &[f64], counts: &[usize], all: &mut [f64]) {
+        all.copy_from_slice(&self.exchange(vec![mine.to_vec(); self.size()], counts));
+    }
+
+    fn gather_f32(&self, mine: &[f32], counts: &[usize], all: &mut [f32]) {
+        let mine: Vec<f64> = mine.iter().copied().map(f64::from).collect();
+        singles(self.exchange(vec![mine; self.size()], counts), all);
+    }
+
+    fn exchange_f32(&self, send: &[f32], send_counts: &[usize], receive: &mut [f32], receive_counts: &[usize]) {
+        let mut rest = send;
+        let parts = send_counts.iter().map(|count| {
+            let (part, after) = rest.split_at(*count);
+            rest = after;
+            part.iter().copied().map(f64::from).collect()
+        });
+        singles(self.exchange(parts.collect(), receive_counts), receive);
+        assert!(rest.is_empty());
+    }
+}
+
+#[test]
+fn training_gives_the_same_bits_for_any_number_of_processes() {
+    let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
+    for (recipe, size) in NETWORKS {
+        for images in [2, 37, 70] {
+            let setup = Setup::new(recipe, size, images);
+            let alone = setup.train(2, images);
+            for ranks in [1, 2, 3, 4, 5] {
+                let table = ThreadRanks::table(ranks);
+                let of_rank = |rank: usize| {
+                    let ranks: Arc<dyn Ranks> = Arc::new(ThreadRanks { rank, table: table.clone() });
+                    let mut plan = TrainingPlan::new(&setup.network, images).with_ranks(ranks);
+                    let share = share(images, false, rank, table.sent.len());
+                    let len = setup.network.input().len();
+                    let x = self::images(&setup.network, &setup.x[share.start * len..share.end * len]);
+                    let labels = ArrayView1::from(&setup.labels[share]);
+                    let (mut optimizer, mut parameters) = (setup.optimizer(), setup.network.initialize(1));
+                    let mut step = |_| {
+                        let input = StepInput { x, labels, seed: 1, step: optimizer.updates };
+                        let (network, loss, pairs) = (&setup.network, &setup.recipe.loss, PairTerms::default());
+                        let loss = plan.step_of_share(network, &mut parameters, loss, &pairs, input, images);
+                        let norm = plan.gradient_norm();
+                        optimizer.step(1e-3, &mut parameters.values, plan.gradient_mut(), norm);
+                        loss
+                    };
+                    let losses: Vec<f64> = (0..3).map(&mut step).collect();
+                    (losses, parameters)
+                };
+                std::thread::scope(|scope| {
+                    let threads: Vec<_> = (0..ranks)
+                        .map(|rank| {
+                            let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+                            let of_rank = &of_rank;
+                            scope.spawn(move || pool.install(|| of_rank(rank)))
+                        })
+                        .collect();
+                    for (rank, thread) in threads.into_iter().enumerate() {
+                        assert!(thread.join().unwrap() == alone, "{recipe}, {images} images, rank {rank} of {ranks}");
+                    }
+                });
+            }
+        }
+    }
+}
+
 #[test]
 fn a_prediction_does_not_depend_on_the_other_images() {
     let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
@@ -312,7 +424,7 @@ fn a_pass_for_statistics_alone_moves_them_as_a_step_does_and_nothing_else() {
         for step in 0..2 {
             let input = || StepInput { x: setup.images(), labels: ArrayView1::from(&setup.labels), seed: 1, step };
             TrainingPlan::new(&setup.network, 9).step(&setup.network, &mut by_step, &setup.recipe.loss, input());
-            TrainingPlan::new(&setup.network, 9).pass_statistics(&setup.network, &mut by_pass, input());
+            TrainingPlan::new(&setup.network, 9).pass_statistics(&setup.network, &mut by_pass, input(), 7);
         }
         assert_eq!(by_pass, by_step);
         assert_eq!(by_pass.statistics != fresh.statistics, recipe == "hyper");

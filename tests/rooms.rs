@@ -5,7 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 /// The top-level rooms. A room may use those above it.
-const ROOMS: [&str; 33] = [
+const ROOMS: [&str; 34] = [
     "error",
     "suggestion",
     "text",
@@ -18,6 +18,7 @@ const ROOMS: [&str; 33] = [
     "files",
     "net",
     "engine",
+    "cluster",
     "dataset",
     "replay",
     "udacity",

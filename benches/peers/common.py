@@ -13,7 +13,15 @@ import time
 STARTED = time.perf_counter()
 
 BATCHES = 8
-INPUTS = {"hyper": (40, 160, 3), "lenet": (64, 64, 1), "pilotnet": (66, 200, 3)}
+INPUTS = {
+    "hyper": (40, 160, 3),
+    "lenet": (64, 64, 1),
+    "pilotnet": (66, 200, 3),
+    "default": (40, 160, 3),
+    "donkey": (120, 160, 3),
+}
+# donkeycar's network gives steering and throttle, the others steering alone.
+OUTPUTS = {network: 2 if network == "donkey" else 1 for network in INPUTS}
 
 
 def arguments(tasks):
@@ -43,7 +51,7 @@ def random_batches(network, batch, channels_first=False):
     shape = (channels, height, width) if channels_first else (height, width, channels)
     rng = np.random.default_rng(0)
     x = [rng.random((batch, *shape), dtype=np.float32) for _ in range(BATCHES)]
-    y = [rng.random((batch, 1), dtype=np.float32) for _ in range(BATCHES)]
+    y = [rng.random((batch, OUTPUTS[network]), dtype=np.float32) for _ in range(BATCHES)]
     return x, y
 
 

@@ -1,10 +1,10 @@
-"""steersman beside its peers on the same machine: training and prediction of the three networks, interleaved.
+"""steersman beside its peers on the same machine: training and prediction of five networks, interleaved.
 
 Every measurement is a process of its own. In each round every contender is measured once, one after the other, so that a
 disturbance hits all of them alike; the table has the medians over the rounds, the spread, and ours ÷ the best peer as the
 median of the rounds' ratios. `compare.sh` installs what is needed into a throw-away environment and runs this.
 
-    python compare.py [--networks hyper lenet pilotnet] [--rounds 5] [--seconds 4] [--markdown FILE]
+    python compare.py [--networks hyper lenet pilotnet default donkey] [--rounds 5] [--seconds 4] [--markdown FILE]
 """
 
 import argparse
@@ -17,9 +17,11 @@ import sys
 import tempfile
 from pathlib import Path
 
+from common import INPUTS
+
 HERE = Path(__file__).parent
 ROOT = HERE.parent.parent
-NETWORKS = ["hyper", "lenet", "pilotnet"]
+NETWORKS = list(INPUTS)
 
 
 def run(command, **environment):

@@ -1,7 +1,7 @@
-"""The three networks in Keras, with the input of `steersman bench`: random numbers, already scaled where the recipe scales."""
+"""The networks in Keras, with the input of `steersman bench`: random numbers, already scaled where the recipe scales."""
 
 import keras
-from common import INPUTS
+from common import INPUTS, OUTPUTS
 from keras import layers
 
 
@@ -43,4 +43,29 @@ def pilotnet():
     ])  # fmt: skip
 
 
-NETWORKS = {"hyper": hyper, "lenet": lenet, "pilotnet": pilotnet}
+def default():
+    def conv(filters, kernel):
+        return [layers.Conv2D(filters, kernel, 2), layers.BatchNormalization(momentum=0.98), layers.ReLU()]
+
+    return keras.Sequential([
+        keras.Input(INPUTS["default"]),
+        *conv(16, 5), *conv(24, 3), *conv(32, 3),
+        layers.Conv2D(48, 3, activation="relu"), layers.Flatten(), layers.Dropout(0.1),
+        layers.Dense(64, activation="relu"), layers.Dense(1),
+    ])  # fmt: skip
+
+
+def donkey():
+    def conv(filters, kernel, strides):
+        return [layers.Conv2D(filters, kernel, strides, activation="relu"), layers.Dropout(0.2)]
+
+    return keras.Sequential([
+        keras.Input(INPUTS["donkey"]),
+        *conv(24, 5, 2), *conv(32, 5, 2), *conv(64, 5, 2), *conv(64, 3, 1), *conv(64, 3, 1), layers.Flatten(),
+        layers.Dense(100, activation="relu"), layers.Dropout(0.2),
+        layers.Dense(50, activation="relu"), layers.Dropout(0.2),
+        layers.Dense(OUTPUTS["donkey"]),
+    ])  # fmt: skip
+
+
+NETWORKS = {network.__name__: network for network in (hyper, lenet, pilotnet, default, donkey)}

@@ -4,7 +4,7 @@
 """
 
 import torch
-from common import arguments, latency, random_batches, report, throughput
+from common import OUTPUTS, arguments, latency, random_batches, report, throughput
 from torch import nn
 
 
@@ -53,7 +53,30 @@ def pilotnet():
     )  # fmt: skip
 
 
-NETWORKS = {"hyper": hyper, "lenet": lenet, "pilotnet": pilotnet}
+def default():
+    def conv(before, after, kernel):
+        return [nn.Conv2d(before, after, kernel, 2), nn.BatchNorm2d(after, eps=1e-3, momentum=0.02), nn.ReLU()]
+
+    return nn.Sequential(
+        *conv(3, 16, 5), *conv(16, 24, 3), *conv(24, 32, 3),
+        nn.Conv2d(32, 48, 3), nn.ReLU(), nn.Flatten(), nn.Dropout(0.1),
+        nn.Linear(48 * 16, 64), nn.ReLU(), nn.Linear(64, 1),
+    )  # fmt: skip
+
+
+def donkey():
+    def conv(before, after, kernel, stride):
+        return [nn.Conv2d(before, after, kernel, stride), nn.ReLU(), nn.Dropout(0.2)]
+
+    return nn.Sequential(
+        *conv(3, 24, 5, 2), *conv(24, 32, 5, 2), *conv(32, 64, 5, 2), *conv(64, 64, 3, 1), *conv(64, 64, 3, 1),
+        nn.Flatten(),
+        nn.Linear(64 * 8 * 13, 100), nn.ReLU(), nn.Dropout(0.2), nn.Linear(100, 50), nn.ReLU(), nn.Dropout(0.2),
+        nn.Linear(50, OUTPUTS["donkey"]),
+    )  # fmt: skip
+
+
+NETWORKS = {network.__name__: network for network in (hyper, lenet, pilotnet, default, donkey)}
 
 
 def tensors(args, batch):

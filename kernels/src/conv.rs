@@ -10,7 +10,8 @@
 //! | `im2col` with `gemm` | weight gradient | one output and more than 32 channels, on vectors of 16 lanes | a matrix product |
 //! | `direct` | forward, weight gradient | any | a sum over taps, with vectors along the output rows |
 //! | `input_gradient` | input gradient | any | the same sum over the zero-padded output gradient, with the kernel turned by 180 degrees |
-//! | `sparse` | both gradients | behind 4x4 max pooling; the caller asks for it | one multiply-add at a time at the few positions with a gradient |
+//! | `pooled` | forward | before 4x4 max pooling; the caller asks for it: [`PooledConv`] | the same sum over taps, with vectors along the windows of the pooling |
+//! | `sparse` | both gradients | the same | one multiply-add at a time at the few positions with a gradient |
 //! | `im2col` with `sgemm` | all | when asked for | the textbook: the image as a matrix of patches, and one matrix product a pass |
 //!
 //! To read how a convolution works, begin with `im2col`: it is the shortest, and the others compute the same.
@@ -23,6 +24,7 @@ mod input_gradient;
 mod layout;
 mod patch_gradient;
 mod phase;
+mod pooled;
 mod span;
 mod sparse;
 mod tap_sum;
@@ -36,6 +38,7 @@ pub use crate::conv_shape::ConvShape;
 use direct::Direct;
 use im2col::Im2col;
 use patch_gradient::PatchGradient;
+pub use pooled::PooledConv;
 
 /// A convolution of one shape on one backend. It holds the tables of each pass.
 #[derive(Clone, Debug)]
@@ -135,9 +138,9 @@ impl Conv {
         self.backend.isa
     }
 
-    /// How it was told to compute its passes.
-    pub fn algorithm(&self) -> ConvAlgorithm {
-        self.backend.conv
+    /// What it runs on.
+    pub fn backend(&self) -> Backend {
+        self.backend
     }
 
     /// Length of the scratch buffer that is enough for every pass, whatever the number of images.
@@ -340,53 +343,5 @@ impl Conv {
             WeightGradient::Winograd(winograd) => winograd.run(x, dy, dweight, dbias, scratch),
             WeightGradient::Im2col(im2col) => im2col.backward_weight(x, dy, dweight, dbias, scratch),
         }
-    }
-}
-
-/// Gradients from `count` positions of each output channel; the gradient at all others is 0.
-///
-/// `argmax` holds the positions, `[n][oc][count]`: where the window of the output begins in a plane of the input, `oy * w + ox`.
-/// Max pooling gives them ([`pool::max_forward_with_argmax`](crate::pool::max_forward_with_argmax)). `dy` holds the output
-/// gradients at these positions.
-impl Conv {
-    /// Whether the shape and the algorithm have sparse gradients: strides of 1, no padding, 3x3 or 5x5 kernels, and
-    /// [`ConvAlgorithm::Auto`].
-    pub fn has_sparse_gradients(&self) -> bool {
-        self.backend.conv == ConvAlgorithm::Auto && sparse::supports(&self.shape)
-    }
-
-    /// As [`Conv::backward_weight`].
-    ///
-    /// # Panics
-    /// If a slice has another length, a position lies outside the plane, or the shape has no sparse gradients.
-    pub fn sparse_backward_weight(
-        &self,
-        n: usize,
-        x: &[f32],
-        argmax: &[u32],
-        dy: &[f32],
-        dweight: &mut [f32],
-        dbias: &mut [f32],
-    ) {
-        self.check_sparse(n, x.len(), argmax.len(), dy.len(), dweight.len());
-        assert_eq!(dbias.len(), self.shape.oc, "sparse conv gradient: length of the bias of {:?}", self.shape);
-        sparse::weight_gradient(self.isa(), &self.shape, x, argmax, dy, dweight, dbias);
-    }
-
-    /// As [`Conv::backward_input`].
-    ///
-    /// # Panics
-    /// As [`Conv::sparse_backward_weight`].
-    pub fn sparse_backward_input(&self, n: usize, argmax: &[u32], dy: &[f32], weight: &[f32], dx: &mut [f32]) {
-        self.check_sparse(n, dx.len(), argmax.len(), dy.len(), weight.len());
-        sparse::input_gradient(self.isa(), &self.shape, argmax, dy, weight, dx);
-    }
-
-    fn check_sparse(&self, n: usize, x_len: usize, argmax: usize, dy: usize, weight: usize) {
-        let shape = &self.shape;
-        assert!(self.has_sparse_gradients(), "no sparse gradients of {shape:?}");
-        assert_eq!(x_len, n * shape.x_len(), "sparse conv gradient: length of the {n} inputs of {shape:?}");
-        assert_eq!(weight, shape.oc * shape.taps(), "sparse conv gradient: length of the weights of {shape:?}");
-        assert!(argmax == dy && dy.is_multiple_of((n * shape.oc).max(1)), "sparse conv gradient: uneven positions");
     }
 }

@@ -25,6 +25,8 @@ pub(crate) enum Level {
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Debug)]
 pub struct Isa(Level);
 
+static BEST: OnceLock<Isa> = OnceLock::new();
+
 impl Isa {
     /// What every processor can run.
     pub const PORTABLE: Isa = Isa(Level::Portable);
@@ -34,13 +36,21 @@ impl Isa {
     /// The environment variable `STEERSMAN_ISA` (`portable`, `neon`, `avx2` or `avx512`) lowers it, for tests; a name
     /// that this processor does not have, or that is unknown, is ignored.
     pub fn best() -> Isa {
-        static BEST: OnceLock<Isa> = OnceLock::new();
-        *BEST.get_or_init(|| {
-            let available = Isa::available();
-            let wanted = std::env::var("STEERSMAN_ISA").unwrap_or_default();
-            let named = available.iter().find(|isa| isa.name() == wanted);
-            *named.or(available.last()).unwrap_or(&Isa::PORTABLE)
-        })
+        *BEST.get_or_init(Isa::wanted)
+    }
+
+    /// What [`best`](Isa::best) answers unless it is lowered.
+    pub fn wanted() -> Isa {
+        let available = Isa::available();
+        let wanted = std::env::var("STEERSMAN_ISA").unwrap_or_default();
+        let named = available.iter().find(|isa| isa.name() == wanted);
+        *named.or(available.last()).unwrap_or(&Isa::PORTABLE)
+    }
+
+    /// Lowers the answer of [`best`](Isa::best) to this one, for processes that compute together; returns that answer, which is another
+    /// if `best` has answered before.
+    pub fn lower_best(self) -> Isa {
+        *BEST.get_or_init(|| self.min(Isa::wanted()))
     }
 
     /// Every instruction set this processor can run, from [`Isa::PORTABLE`] to the widest.

@@ -2,10 +2,7 @@
 //!
 //! # NaN
 //! [`max_forward`] skips a NaN; a window of NaN alone gives minus infinity, and its gradient reaches no input.
-//! [`max_forward_with_argmax`] compares down the columns first: a NaN in the upper row hides its column, and one in the upper left
-//! place makes the window NaN. [`average_forward`] passes a NaN on.
-
-use crate::simd::{Simd, get, get_first, put};
+//! [`average_forward`] passes a NaN on.
 
 /// The sizes of a pooling layer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -66,97 +63,6 @@ per_isa! {
                 }
             }
         }
-    }
-}
-
-per_isa! {
-    /// As [`max_forward`], and writes to `argmax`, as long as `y`, the index of the first maximum of each window in its plane:
-    /// `row * pitch + column`. Only for windows of 4 columns that neither overlap nor leave gaps.
-    pub fn max_forward_with_argmax<S>(
-        simd: S,
-        shape: &PoolShape,
-        n: usize,
-        pitch: usize,
-        x: &[f32],
-        y: &mut [f32],
-        argmax: &mut [u32],
-    ) {
-        shape.check("max_forward_with_argmax", n, x.len(), y.len());
-        let &PoolShape { h, w, kh, kw, stride_h, stride_w, .. } = shape;
-        assert!((kw, stride_w, stride_h) == (4, 4, kh), "max_forward_with_argmax: not for windows of {shape:?}");
-        assert_eq!(argmax.len(), y.len(), "max_forward_with_argmax: y and argmax differ in length");
-        if y.is_empty() {
-            return;
-        }
-        let (out_h, out_w) = (shape.out_h(), shape.out_w());
-        let outputs = y.chunks_exact_mut(out_h * out_w).zip(argmax.chunks_exact_mut(out_h * out_w));
-        for (x, (y, argmax)) in x.chunks_exact(h * w).zip(outputs) {
-            let rows = y.chunks_exact_mut(out_w).zip(argmax.chunks_exact_mut(out_w));
-            for (oy, (y, argmax)) in rows.enumerate() {
-                let rows = &x[oy * kh * w..(oy + 1) * kh * w];
-                let windows = y.chunks_mut(STRIP / 4).zip(argmax.chunks_mut(STRIP / 4));
-                for (strip, (y, argmax)) in windows.enumerate() {
-                    let first = (oy * kh * pitch + strip * STRIP) as u32;
-                    max_of_strip(simd, &rows[strip * STRIP..], w, kh, first, pitch as u32, y, argmax);
-                }
-            }
-        }
-    }
-}
-
-/// Columns at a time, in [`max_forward_with_argmax`].
-const STRIP: usize = 64;
-
-/// A row of at most `STRIP / 4` windows of 4 columns and `kh` rows, the first of which begins at `rows[0]`, with index
-/// `first`.
-#[inline(always)]
-fn max_of_strip<S: Simd>(
-    simd: S,
-    rows: &[f32],
-    w: usize,
-    kh: usize,
-    first: u32,
-    pitch: u32,
-    y: &mut [f32],
-    argmax: &mut [u32],
-) {
-    // Down the columns first, vector by vector: the maximum of each column and its row.
-    let columns = 4 * y.len();
-    let (mut max, mut row_of) = ([f32::NEG_INFINITY; STRIP], [0.0f32; STRIP]);
-    let whole = columns - columns % S::LANES;
-    for at in (0..whole).step_by(S::LANES) {
-        let (mut best, mut best_row) = (get(simd, rows, at), simd.splat(0.0));
-        for ky in 1..kh {
-            let x = get(simd, rows, ky * w + at);
-            best_row = simd.select_greater(x, best, simd.splat(ky as f32), best_row);
-            best = simd.select_greater(x, best, x, best);
-        }
-        put(simd, &mut max, at, best);
-        put(simd, &mut row_of, at, best_row);
-    }
-    if whole < columns {
-        // The lanes after the last column are not used.
-        let rest = columns - whole;
-        let (mut best, mut best_row) = (get_first(simd, rows, whole, rest), simd.splat(0.0));
-        for ky in 1..kh {
-            let x = get_first(simd, rows, ky * w + whole, rest);
-            best_row = simd.select_greater(x, best, simd.splat(ky as f32), best_row);
-            best = simd.select_greater(x, best, x, best);
-        }
-        put(simd, &mut max, whole, best);
-        put(simd, &mut row_of, whole, best_row);
-    }
-    // Then across the four columns of each window; of equal values the one in the upper row, then the left one.
-    let windows = max.as_chunks::<4>().0.iter().zip(row_of.as_chunks::<4>().0);
-    for (i, ((y, argmax), (max, row_of))) in y.iter_mut().zip(argmax).zip(windows).enumerate() {
-        let (mut best, mut best_row, mut column) = (max[0], row_of[0], 0);
-        for j in 1..4 {
-            if max[j] > best || (max[j] == best && row_of[j] < best_row) {
-                (best, best_row, column) = (max[j], row_of[j], j as u32);
-            }
-        }
-        *y = best;
-        *argmax = first + best_row as u32 * pitch + 4 * i as u32 + column;
     }
 }
 

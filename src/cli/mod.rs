@@ -47,6 +47,8 @@ mod train;
 mod verdict;
 mod video;
 mod words;
+#[cfg(feature = "mpi")]
+mod worker;
 
 use std::io::{self, IsTerminal, Write};
 use std::path::Path;
@@ -147,8 +149,15 @@ enum Command {
     Import(import::ImportArgs),
 }
 
-/// Runs the command line of this process.
+/// Runs the command line of this process. Among the ranks of an MPI job only rank 0 reads it; the others do what it tells them.
 pub fn main() -> ExitCode {
+    #[cfg(feature = "mpi")]
+    return crate::cluster::mpi::run(command, worker::run, |text| eprintln!("{text}"));
+    #[cfg(not(feature = "mpi"))]
+    command()
+}
+
+fn command() -> ExitCode {
     let started = Instant::now();
     let cli = match Cli::try_parse() {
         Ok(cli) => cli,
@@ -189,7 +198,8 @@ fn wrong_arguments(error: &clap::Error) -> ExitCode {
     let text = error.render().to_string();
     let hint = recipe_entry(error, std::env::args_os().map(|arg| arg.to_string_lossy().into_owned()).collect());
     if escaped_lines(&text) == text && hint.is_none() {
-        error.exit();
+        let _ = error.print();
+        return ExitCode::from(error.exit_code() as u8);
     }
     eprintln!("{}", text.trim_end());
     if let Some(hint) = hint {
@@ -286,8 +296,9 @@ fn camera_preset(name: &str) -> Result<CarGeometry> {
     }
 }
 
-/// A rayon pool of `threads` (0: one for each core).
+/// A rayon pool of `threads` (0: one for each core, which the ranks on a machine share out).
 fn pool(threads: usize) -> Result<rayon::ThreadPool> {
+    let threads = crate::cluster::threads(threads);
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
     pool.map_err(|e| {
         Error::System(format!("cannot start {threads} threads: {e}; give a smaller number with --threads"))

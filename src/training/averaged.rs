@@ -4,6 +4,7 @@ use ndarray::ArrayView1;
 
 use super::checkpoint::State;
 use super::data::images;
+use super::together::Together;
 use crate::dataset::loader::{Batch, Loader};
 use crate::engine::network::{Network, StepInput, TrainingPlan};
 use crate::error::Result;
@@ -17,7 +18,7 @@ use crate::error::Result;
 pub(super) fn refit_statistics(
     state: &mut State,
     (network, plan): (&Network, &mut TrainingPlan),
-    training: &Loader,
+    (training, together): (&Loader, &Together),
     [current, next]: &mut [Batch; 2],
     seed: u64,
 ) -> Result<()> {
@@ -28,20 +29,26 @@ pub(super) fn refit_statistics(
     }
     let parameters = &mut average.parameters;
     parameters.statistics.copy_from_slice(&state.parameters.statistics);
-    training.fill(0, current)?;
+    let filled = together.fill(training, 0, current);
+    let complete = together.meet(filled, Ok(()))?;
+    together.settle(training, current, complete)?;
     for batch in 0..batches {
         // The next batch is loaded while the network looks at this one.
         let ((), filled) = rayon::join(
             || {
                 if current.n > 0 {
                     let (x, labels) = (images(network.input(), current), ArrayView1::from(&current.labels));
-                    plan.pass_statistics(network, parameters, StepInput { x, labels, seed, step: batch as u64 });
+                    let input = StepInput { x, labels, seed, step: batch as u64 };
+                    plan.pass_statistics(network, parameters, input, current.n);
                 }
             },
-            || if batch + 1 < batches { training.fill(batch + 1, next) } else { Ok(()) },
+            || if batch + 1 < batches { together.fill(training, batch + 1, next) } else { Ok(true) },
         );
-        filled?;
+        let complete = together.meet(filled, Ok(()))?;
         std::mem::swap(current, next);
+        if batch + 1 < batches {
+            together.settle(training, current, complete)?;
+        }
     }
     Ok(())
 }

@@ -11,6 +11,7 @@ use super::profile::Profile;
 use super::request::{TrainRequest, TrainResult, TrainingEvent};
 use super::run::TrainingRun;
 use super::run_folder::{RunFolder, RunInfo};
+use super::together;
 use super::transfer::{Start, TransferRequest};
 use crate::dataset::held_out::held_out_tracks;
 use crate::error::{Error, Result};
@@ -79,8 +80,11 @@ pub fn train(
     }
     data.write_split(&folder.file("split.csv"))?;
     folder.write_json("run.json", &info)?;
-    let run = TrainingRun::new((folder, lock), info, recipe, data, start, started)?;
-    run.measured(profile).run(observer, stop)
+    // The other ranks look for the recordings where the user said, which may be another folder there.
+    let given = RunInfo { recordings, validate, also, simulator, ..info.clone() };
+    let mut run = TrainingRun::new((folder, Some(lock)), info, recipe, data, start, started)?.measured(profile);
+    let _claim = together::invite(&mut run, &given)?;
+    run.run(observer, stop)
 }
 
 /// Goes on with the run in `path`, as if it had never stopped; returns the result again if it is finished. With `profile` the
@@ -174,7 +178,9 @@ pub fn resume_with(
     }
     let from = info.transfer.as_ref().map(TransferRequest::of);
     let start = from.map(|from| Start::load(&folder.from(), &from, &recipe, info.seed)).transpose()?;
-    let mut run = TrainingRun::new((folder, lock), info, recipe, data, start, started)?;
+    let given = info.clone();
+    let mut run = TrainingRun::new((folder, Some(lock)), info, recipe, data, start, started)?.measured(profile);
     run.restore()?;
-    run.measured(profile).run(observer, stop)
+    let _claim = together::invite(&mut run, &given)?;
+    run.run(observer, stop)
 }

@@ -8,6 +8,7 @@ use super::history::EpochRecord;
 use crate::engine::network::{Network, Parameters};
 use crate::engine::optimizer::{Optimizer, Plateau, WeightAverage};
 use crate::error::{Error, Result};
+use crate::files::atomic_file;
 use crate::model_file::{self, StoredTensor};
 
 const FORMAT: u32 = 1;
@@ -91,6 +92,15 @@ impl State {
     ///
     /// [`Error::Io`].
     pub fn save(&self, path: &Path, network: &Network) -> Result<()> {
+        atomic_file::write(path, &self.to_bytes(path, network)?)
+    }
+
+    /// The bytes of the state in the file `path`.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Data`] if the format cannot hold it.
+    pub fn to_bytes(&self, path: &Path, network: &Network) -> Result<Vec<u8>> {
         let metadata = Metadata {
             format: FORMAT,
             updates: self.optimizer.updates,
@@ -109,7 +119,7 @@ impl State {
                 tensors.push(StoredTensor { name: format!("{prefix}{}", tensor.name), ..tensor });
             }
         }
-        model_file::write_tensors(path, &tensors, metadata)
+        model_file::tensor_bytes(path, &tensors, metadata)
     }
 
     /// Reads a state for `network`; `optimizer` and `average` are fresh ones and take over what is stored.
@@ -117,14 +127,23 @@ impl State {
     /// # Errors
     ///
     /// [`Error::Io`] and [`Error::Data`].
-    pub fn load(
+    pub fn load(path: &Path, network: &Network, optimizer: Optimizer, average: Option<WeightAverage>) -> Result<State> {
+        State::of_bytes(path, &model_file::read_file(path)?, network, optimizer, average)
+    }
+
+    /// The same of the `bytes` of a file, which errors call `path`.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Data`].
+    pub fn of_bytes(
         path: &Path,
+        bytes: &[u8],
         network: &Network,
         mut optimizer: Optimizer,
         mut average: Option<WeightAverage>,
     ) -> Result<State> {
-        let bytes = model_file::read_file(path)?;
-        let (tensors, metadata) = model_file::read_tensors(path, &bytes)?;
+        let (tensors, metadata) = model_file::read_tensors(path, bytes)?;
         let metadata: Metadata =
             serde_json::from_str(&metadata).map_err(|e| Error::data(path, format!("is no checkpoint: {e}")))?;
         if metadata.format != FORMAT {

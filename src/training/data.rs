@@ -20,9 +20,10 @@ use crate::files::atomic_file;
 use crate::geometry::LookAhead;
 use crate::recipe::Recipe;
 
-/// The images of `batch`, `(n, c, h, w)`, for a network whose input is `input`.
+/// The images of the share of `batch`, `(n, c, h, w)`, for a network whose input is `input`.
 pub(super) fn images(input: Shape, batch: &Batch) -> ArrayView4<'_, f32> {
-    ArrayView4::from_shape(input.batch(batch.n), &batch.x).expect("a loader makes images of the network's input shape")
+    ArrayView4::from_shape(input.batch(batch.share.len()), &batch.x)
+        .expect("a loader makes images of the network's input shape")
 }
 
 /// Where the recordings of a run are.

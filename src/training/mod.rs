@@ -27,6 +27,7 @@ mod profile;
 mod request;
 mod run;
 mod run_folder;
+mod together;
 mod transfer;
 mod validation;
 
@@ -38,4 +39,5 @@ pub use pace::{Pace, PaceNow};
 pub use profile::ProfileReport;
 pub use request::{TrainRequest, TrainResult, TrainingEvent};
 pub(crate) use run_folder::{NewRun, RunFolder, RunInfo};
+pub use together::take_part;
 pub use transfer::TransferRequest;

@@ -14,6 +14,9 @@ use crate::model_file::{Model, TrainingRecord, weights_hash};
 impl TrainingRun {
     /// Writes the checkpoint and the models. The weights are those of the last epoch that is done.
     pub(super) fn save_checkpoint(&self) -> Result<()> {
+        if !self.together.leads() {
+            return Ok(());
+        }
         self.save_with_last(self.state.progress.history.len() as u32)
     }
 

@@ -12,11 +12,12 @@ use super::history::EpochRecord;
 use super::profile::Profile;
 use super::request::{TrainResult, TrainingEvent};
 use super::run_folder::{RunFolder, RunInfo, RunLock};
+use super::together::Together;
 use super::transfer::Start;
 use super::validation::{Validation, ValidationResult};
 use crate::dataset::loader::{Batch, Loader};
 use crate::engine::loss::{PairTerms, Smoothness};
-use crate::engine::network::{Network, PAIRS_CAPACITY, StepInput, TrainingPlan};
+use crate::engine::network::{Network, StepInput, TrainingPlan};
 use crate::engine::optimizer::{Optimizer, WeightAverage};
 use crate::engine::stopwatch::Stopwatch;
 use crate::error::{Error, Result};
@@ -29,8 +30,8 @@ const MAX_ROW_IMAGES: usize = 6;
 /// A run: its data, its network, and how far it is.
 pub(super) struct TrainingRun {
     pub(super) folder: RunFolder,
-    /// Held until the end of the run.
-    pub(super) _lock: RunLock,
+    /// Held until the end of the run by the process that writes.
+    pub(super) _lock: Option<RunLock>,
     pub(super) info: RunInfo,
     pub(super) recipe: Recipe,
     pub(super) network: Network,
@@ -45,11 +46,12 @@ pub(super) struct TrainingRun {
     pub(super) state: State,
     pub(super) started: Instant,
     pub(super) profile: Option<Profile>,
+    pub(super) together: Together,
 }
 
 impl TrainingRun {
     pub(super) fn new(
-        (folder, lock): (RunFolder, RunLock),
+        (folder, lock): (RunFolder, Option<RunLock>),
         info: RunInfo,
         recipe: Recipe,
         data: Data,
@@ -57,8 +59,8 @@ impl TrainingRun {
         started: Instant,
     ) -> Result<TrainingRun> {
         let mut network = recipe.network(Backend { isa: Isa::best(), conv: info.conv_algorithm(&folder)? })?;
-        if let Some(start) = &start {
-            network.freeze(&start.transfer.frozen)?;
+        if let Some(transfer) = &info.transfer {
+            network.freeze(&transfer.frozen)?;
         }
         let optimizer = Optimizer::new(recipe.optimizer, recipe.clip_gradient_norm, network.tensors(), network.isa());
         let (leak_percent, mut training_rows) = (data.leak_percent(), data.training_row_ids());
@@ -92,7 +94,7 @@ impl TrainingRun {
         let capacity = recipe.batch.min(most).max(MAX_ROW_IMAGES);
         let plan_capacity = match smoothness {
             // Each sample may bring a partner.
-            Some(_) => recipe.batch.min(2 * most).max(capacity).next_multiple_of(PAIRS_CAPACITY),
+            Some(_) => recipe.batch.min(2 * most).max(capacity),
             None => capacity,
         };
         let plan = TrainingPlan::new(&network, plan_capacity);
@@ -122,6 +124,7 @@ impl TrainingRun {
             notices,
             started,
             profile: None,
+            together: Together::default(),
         })
     }
 
@@ -149,10 +152,25 @@ impl TrainingRun {
     }
 
     pub(super) fn run(mut self, observer: &mut dyn Observer<TrainingEvent>, stop: &StopSignal) -> Result<TrainResult> {
+        let begun = self.tell(observer);
+        self.go(begun, observer, stop)?;
+        self.finish()
+    }
+
+    fn tell(&self, observer: &mut dyn Observer<TrainingEvent>) -> Result<()> {
         observer.observe(TrainingEvent::Begin { folder: self.folder.path().into() })?;
-        for notice in &self.notices {
-            observer.observe(TrainingEvent::Notice(notice.clone()))?;
-        }
+        self.notices.iter().try_for_each(|notice| observer.observe(TrainingEvent::Notice(notice.clone())))
+    }
+
+    /// Trains until the last epoch has ended, unless what `begun` says failed on this or another rank.
+    pub(super) fn go(
+        &mut self,
+        begun: Result<()>,
+        observer: &mut dyn Observer<TrainingEvent>,
+        stop: &StopSignal,
+    ) -> Result<()> {
+        self.together.meet(Ok(true), begun)?;
+        let (updates_before, sent_before) = (self.state.optimizer.updates, self.together.sent_bytes());
         let seconds_before = self.state.progress.seconds;
         let mut images_unreported = true;
         let mut batches = [Batch::default(), Batch::default()];
@@ -171,12 +189,12 @@ impl TrainingRun {
             averaged::refit_statistics(
                 &mut self.state,
                 (&self.network, &mut self.plan),
-                &self.training,
+                (&self.training, &self.together),
                 &mut batches,
                 self.info.seed,
             )?;
             let validation = match &mut self.validation {
-                Some(validation) => validation.run(&self.network, self.state.model())?,
+                Some(validation) => validation.run(&self.network, self.state.model(), &self.together)?,
                 None => None,
             };
             if validation.is_some_and(|v| !(v.mse.is_finite() && v.weighted_mse.is_finite())) {
@@ -185,14 +203,32 @@ impl TrainingRun {
             let record = self.end_epoch(validation, epoch_started);
             let observed = observer.observe(TrainingEvent::Epoch { record, of: self.recipe.epochs });
             let reported = match whole && std::mem::take(&mut images_unreported) {
-                true => self.report_images(observer),
+                true => {
+                    self.share_thumbnails();
+                    self.report_images(observer)
+                }
                 false => Ok(()),
             };
             self.state.progress.seconds = seconds_before + self.started.elapsed().as_secs_f64();
-            self.save_checkpoint()?;
-            observed.and(reported)?;
+            let saved = self.save_checkpoint();
+            self.together.meet(Ok(true), saved.and(observed).and(reported))?;
         }
-        self.finish()
+        self.share_thumbnails();
+        let updates = self.state.optimizer.updates - updates_before;
+        if let Some(team) = self.together.team().filter(|_| updates > 0) {
+            let sent = self.together.sent_bytes() - sent_before;
+            let (ranks, each) = (team.size(), sent as f64 / updates as f64 / 1e6);
+            let notice = format!("{ranks} ranks made {updates} steps together; each sent about {each:.2} MB a step");
+            observer.observe(TrainingEvent::Notice(notice))?;
+        }
+        Ok(())
+    }
+
+    fn share_thumbnails(&self) {
+        self.together.share_thumbnails(&self.training);
+        if let Some(validation) = &self.validation {
+            self.together.share_thumbnails(validation.loader());
+        }
     }
 
     /// Trains on the remaining batches of the current epoch.
@@ -211,12 +247,16 @@ impl TrainingRun {
         let waiting = self.profile.as_ref().map_or_else(Stopwatch::default, |profile| profile.waiting.clone());
         let updates_in_all = batches as u64 * u64::from(self.recipe.epochs);
         if self.state.progress.next_batch < batches {
-            let (training, batch) = (&self.training, self.state.progress.next_batch);
-            waiting.time(|| training.fill(batch, current))?;
+            let (training, together, batch) = (&self.training, &self.together, self.state.progress.next_batch);
+            waiting.time(|| {
+                let filled = together.fill(training, batch, current);
+                let complete = together.meet(filled, Ok(()))?;
+                together.settle(training, current, complete)
+            })?;
         }
         while self.state.progress.next_batch < batches {
             let batch = self.state.progress.next_batch;
-            let (training, following) = (&self.training, batch + 1);
+            let (training, together, following) = (&self.training, &self.together, batch + 1);
             let step = u64::from(epoch) * batches as u64 + batch as u64;
             let State { parameters, optimizer, average, progress, .. } = &mut self.state;
             let (network, plan, loss) = (&self.network, &mut self.plan, &self.recipe.loss);
@@ -229,11 +269,10 @@ impl TrainingRun {
                     }
                     let (x, labels) = (images(network.input(), current), ArrayView1::from(&current.labels));
                     let input = StepInput { x, labels, seed: self.info.seed, step };
-                    (plan.step_with_pairs(network, parameters, loss, &pairs, input), Instant::now())
+                    (plan.step_of_share(network, parameters, loss, &pairs, input, current.n), Instant::now())
                 },
-                || if following < batches { training.fill(following, next) } else { Ok(()) },
+                || if following < batches { together.fill(training, following, next) } else { Ok(true) },
             );
-            filled?;
             waiting.add(step_done.elapsed());
             if current.n > 0 {
                 let norm = plan.gradient_norm();
@@ -260,7 +299,11 @@ impl TrainingRun {
             });
             std::mem::swap(current, next);
             let ended = observed.and_then(|()| stop.check()).and_then(|()| self.require_pictures());
-            if let Err(error) = ended {
+            let met = self.together.meet(filled, ended).and_then(|complete| match following < batches {
+                true => self.together.settle(&self.training, current, complete),
+                false => Ok(()),
+            });
+            if let Err(error) = met {
                 self.state.progress.seconds = seconds_before + self.started.elapsed().as_secs_f64();
                 self.save_checkpoint()?;
                 return Err(error);

@@ -3,6 +3,7 @@
 use ndarray::ArrayViewMut1;
 
 use super::data;
+use super::together::Together;
 use crate::dataset::leak::NearTwins;
 use crate::dataset::loader::{Batch, Loader, LoaderTimes};
 use crate::dataset::{OutputKind, Outputs, View};
@@ -39,7 +40,10 @@ pub(super) struct Validation {
     loader: Loader,
     plan: InferencePlan,
     batches: [Batch; 2],
+    /// Those of this process, and those of all with their labels.
     predictions: Vec<f32>,
+    all_predictions: Vec<f32>,
+    all_labels: Vec<f32>,
     full_lock_deg: f64,
     outputs: Outputs,
     /// For each row of each recording, as far as asked for.
@@ -53,6 +57,8 @@ impl Validation {
             plan: InferencePlan::new(network, capacity),
             batches: [Batch::default(), Batch::default()],
             predictions: vec![0.0; capacity * network.output().len()],
+            all_predictions: Vec::new(),
+            all_labels: Vec::new(),
             loader,
             full_lock_deg: recipe.full_lock_deg,
             outputs: recipe.outputs.clone(),
@@ -71,6 +77,11 @@ impl Validation {
         self.plan.measure(evaluation);
     }
 
+    /// The images of the side.
+    pub fn loader(&self) -> &Loader {
+        &self.loader
+    }
+
     /// Number of images without those that could not be decoded so far, each mirrored one counted too.
     pub fn images(&self) -> usize {
         self.loader.samples_used()
@@ -86,14 +97,20 @@ impl Validation {
         self.loader.near_twins(training)
     }
 
-    /// Runs the network over the whole side. `None` if no image can be read.
+    /// Runs the network over the whole side, with those that train together. `None` if no image can be read.
     ///
     /// # Errors
     ///
     /// [`Error::Io`](crate::Error::Io) if the image cache fails.
-    pub fn run(&mut self, network: &Network, parameters: &Parameters) -> Result<Option<ValidationResult>> {
-        let Validation { loader, plan, batches: [current, next], predictions, full_lock_deg, outputs, path_labels } =
-            self;
+    pub fn run(
+        &mut self,
+        network: &Network,
+        parameters: &Parameters,
+        together: &Together,
+    ) -> Result<Option<ValidationResult>> {
+        let Validation { loader, plan, batches: [current, next], predictions, full_lock_deg, outputs, .. } = self;
+        let (all_predictions, all_labels, path_labels) =
+            (&mut self.all_predictions, &mut self.all_labels, &self.path_labels);
         let count = outputs.count();
         // Of the outputs beside the steering.
         let mut squares_beside = vec![0.0; count - 1];
@@ -101,23 +118,29 @@ impl Validation {
         let (mut squares, mut images) = (0.0, 0usize);
         let (mut center_squares, mut center_absolute, mut label_squares, mut center_images) = (0.0, 0.0, 0.0, 0usize);
         let (mut path_squares, mut path_images) = (0.0, 0usize);
-        loader.fill(0, current)?;
+        let filled = together.fill(loader, 0, current);
+        let complete = together.meet(filled, Ok(()))?;
+        together.settle(loader, current, complete)?;
         for batch in 0..loader.batches() {
             // The next batch is loaded while the network evaluates this one.
-            let predictions = &mut predictions[..current.n * count];
+            let predictions = &mut predictions[..current.share.len() * count];
             let ((), filled) = rayon::join(
                 || {
-                    plan.run(
-                        network,
-                        parameters,
-                        data::images(network.input(), current),
-                        ArrayViewMut1::from(&mut *predictions),
-                    )
+                    if !current.share.is_empty() {
+                        plan.run(
+                            network,
+                            parameters,
+                            data::images(network.input(), current),
+                            ArrayViewMut1::from(&mut *predictions),
+                        );
+                    }
                 },
-                || if batch + 1 < loader.batches() { loader.fill(batch + 1, next) } else { Ok(()) },
+                || if batch + 1 < loader.batches() { together.fill(loader, batch + 1, next) } else { Ok(true) },
             );
-            filled?;
-            let answers = current.labels.chunks_exact(count).zip(predictions.chunks_exact(count));
+            let complete = together.meet(filled, Ok(()))?;
+            together.gather(predictions, current.n, count, all_predictions);
+            together.gather(&current.labels, current.n, count, all_labels);
+            let answers = all_labels.chunks_exact(count).zip(all_predictions.chunks_exact(count));
             for (sample, (labels, predictions)) in current.samples.iter().zip(answers) {
                 let is_plain = sample.camera == View::Centre && !sample.mirrored;
                 for beside in 1..count {
@@ -142,6 +165,9 @@ impl Validation {
                 }
             }
             std::mem::swap(current, next);
+            if batch + 1 < loader.batches() {
+                together.settle(loader, current, complete)?;
+            }
         }
         if images == 0 {
             return Ok(None);

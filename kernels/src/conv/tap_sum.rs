@@ -69,26 +69,10 @@ impl TapSum {
         (self.channels + MAX_CHANNELS) * (self.taps.len() + 1)
     }
 
-    /// Packs bias (`None`: 0) and weights into one panel for each tile: first the bias of its channels, then their weights, tap by
-    /// tap.
+    /// Packs bias (`None`: 0) and weights for [`run`], see [`pack_panels`].
     pub fn pack(&self, isa: Isa, bias: Option<&[f32]>, weight: &[f32], packed: &mut [f32]) {
-        let height = tile_height(isa.has_many_registers(), self.channels);
-        let panels = packed.chunks_exact_mut(height * (self.taps.len() + 1));
-        for (first, to) in (0..self.channels).step_by(height).zip(panels) {
-            let rows = height.min(self.channels - first);
-            let (to_bias, to) = to.split_at_mut(height);
-            to_bias.fill(0.0);
-            if let Some(bias) = bias {
-                to_bias[..rows].copy_from_slice(&bias[first..first + rows]);
-            }
-            for (to, &from) in to.chunks_exact_mut(height).zip(&self.weights) {
-                let from = weight[from + first * self.weight_stride..].iter().step_by(self.weight_stride);
-                to[rows..].fill(0.0);
-                for (to, &weight) in to[..rows].iter_mut().zip(from) {
-                    *to = weight;
-                }
-            }
-        }
+        let taps = self.weights.iter().copied();
+        pack_panels(isa, self.channels, bias, weight, self.weight_stride, taps, packed);
     }
 
     /// The largest offset of a tap.
@@ -221,6 +205,36 @@ impl TapSum {
                         }
                     }
                 }
+            }
+        }
+    }
+}
+
+/// Packs bias (`None`: 0) and weights into one panel for each tile: first the bias of its channels, then their weights, tap by
+/// tap. `taps` are the offsets of the taps' weights for channel 0, `stride` is the distance between two channels.
+pub(super) fn pack_panels(
+    isa: Isa,
+    channels: usize,
+    bias: Option<&[f32]>,
+    weight: &[f32],
+    stride: usize,
+    taps: impl ExactSizeIterator<Item = usize> + Clone,
+    packed: &mut [f32],
+) {
+    let height = tile_height(isa.has_many_registers(), channels);
+    let panels = packed.chunks_exact_mut(height * (taps.len() + 1));
+    for (first, to) in (0..channels).step_by(height).zip(panels) {
+        let rows = height.min(channels - first);
+        let (to_bias, to) = to.split_at_mut(height);
+        to_bias.fill(0.0);
+        if let Some(bias) = bias {
+            to_bias[..rows].copy_from_slice(&bias[first..first + rows]);
+        }
+        for (to, from) in to.chunks_exact_mut(height).zip(taps.clone()) {
+            let from = weight[from + first * stride..].iter().step_by(stride);
+            to[rows..].fill(0.0);
+            for (to, &weight) in to[..rows].iter_mut().zip(from) {
+                *to = weight;
             }
         }
     }

@@ -39,14 +39,6 @@ pub(crate) fn get_first<S: Simd>(simd: S, from: &[f32], at: usize, count: usize)
     unsafe { simd.load_first(from.as_ptr(), from.len()) }
 }
 
-/// Writes the `LANES` elements from `at` on.
-#[inline(always)]
-pub(crate) fn put<S: Simd>(simd: S, to: &mut [f32], at: usize, v: S::V) {
-    let to = &mut to[at..at + S::LANES];
-    // SAFETY: the slice has `LANES` elements.
-    unsafe { simd.store(to.as_mut_ptr(), v) };
-}
-
 /// Writes the first `count` lanes, at most `LANES`, from `at` on.
 #[inline(always)]
 pub(crate) fn put_first<S: Simd>(simd: S, to: &mut [f32], at: usize, v: S::V, count: usize) {

@@ -1,7 +1,7 @@
 //! Kernels that do what several others do, against those loops one after the other.
 
 use super::{Failures, isas, nans, numbers};
-use steersman_kernels::conv::{Conv, ConvShape};
+use steersman_kernels::conv::{ConvShape, PooledConv};
 use steersman_kernels::norm_rectify::{self, ChannelMeans, ChannelStatistics, RectifyShape, Slopes};
 use steersman_kernels::{pool, reference};
 
@@ -93,34 +93,6 @@ fn norm_rectify_agrees_with_its_parts() {
 }
 
 #[test]
-fn of_equal_values_in_a_window_the_index_is_that_of_the_first() {
-    let mut failures = Failures::default();
-    let [c, h, w, n] = [2, 9, 150, 2];
-    for kh in [1, 2, 3] {
-        let shape = pool::PoolShape { c, h, w, kh, kw: 4, stride_h: kh, stride_w: 4 };
-        let (out_h, out_w) = (shape.out_h(), shape.out_w());
-        // So coarse that most windows have two largest values or more.
-        let x: Vec<f32> = numbers(1, n * c * h * w).iter().map(|v| v.round()).collect();
-        let mut expected = Vec::new();
-        for plane in x.chunks_exact(h * w) {
-            for at in 0..out_h * out_w {
-                let (top, left) = (at / out_w * kh, at % out_w * 4);
-                let places = (0..4 * kh).map(|k| (top + k / 4) * w + left + k % 4);
-                let max = places.clone().map(|place| plane[place]).fold(f32::NEG_INFINITY, f32::max);
-                expected.push(places.clone().find(|place| plane[*place] == max).unwrap() as f32);
-            }
-        }
-        for isa in isas() {
-            let (mut y, mut argmax) = (nans(expected.len()), vec![0; expected.len()]);
-            pool::max_forward_with_argmax(isa, &shape, n, w, &x, &mut y, &mut argmax);
-            let argmax: Vec<f32> = argmax.iter().map(|&at| at as f32).collect();
-            failures.compare(&format!("{} {kh}", isa.name()), &argmax, &expected, 0.0);
-        }
-    }
-    failures.report();
-}
-
-#[test]
 fn of_equal_values_in_a_window_the_first_gets_the_gradient() {
     let mut failures = Failures::default();
     let [c, h, w, n] = [2, 6, 70, 2];
@@ -164,37 +136,66 @@ fn of_equal_values_in_a_window_the_first_gets_the_gradient() {
 }
 
 #[test]
-fn gradients_behind_a_pooling_agree_with_those_of_the_whole_map() {
+fn a_pooled_convolution_agrees_with_its_parts() {
     let mut failures = Failures::default();
+    let shapes = [
+        ([1, 14, 18, 3], 3),
+        ([3, 11, 7, 2], 3),
+        ([2, 9, 13, 5], 5),
+        ([1, 6, 6, 1], 3),
+        ([1, 64, 64, 6], 3),
+        ([6, 15, 15, 16], 3),
+        ([2, 7, 141, 9], 3),
+    ];
     for isa in isas() {
-        for ([c, h, w, oc], k) in [([1, 14, 18, 3], 3), ([3, 11, 7, 2], 3), ([2, 9, 13, 5], 5), ([1, 6, 6, 1], 3)] {
-            let n = 2;
+        for ([c, h, w, oc], k) in shapes {
+            let n = 11;
             let [pad_top, pad_bottom, pad_left, pad_right] = [0; 4];
             let (stride_h, stride_w) = (1, 1);
             let shape =
                 ConvShape { c, h, w, oc, kh: k, kw: k, stride_h, stride_w, pad_top, pad_bottom, pad_left, pad_right };
             let what = format!("{} {shape:?}", isa.name());
-            let (out_h, out_w) = (shape.out_h(), shape.out_w());
-            let pool_shape = pool::PoolShape { c: oc, h: out_h, w: out_w, kh: 4, kw: 4, stride_h: 4, stride_w: 4 };
-            let pooled = n * oc * pool_shape.out_h() * pool_shape.out_w();
-            let (map, dpooled) = (numbers(1, n * oc * out_h * out_w), numbers(2, pooled));
-            let (mut y, mut expected, mut argmax) = (nans(pooled), nans(pooled), vec![u32::MAX; pooled]);
-            pool::max_forward_with_argmax(isa, &pool_shape, n, w, &map, &mut y, &mut argmax);
-            reference::max_forward(&pool_shape, n, &map, &mut expected);
-            failures.compare(&format!("maximum {what}"), &y, &expected, 0.0);
-            let mut dmap = nans(map.len());
-            reference::max_backward(&pool_shape, n, &map, &y, &dpooled, &mut dmap);
+            let pool_shape =
+                pool::PoolShape { c: oc, h: shape.out_h(), w: shape.out_w(), kh: 4, kw: 4, stride_h: 4, stride_w: 4 };
+            let (out_h, out_w) = (pool_shape.out_h(), pool_shape.out_w());
+            // Whole numbers: nothing is rounded, and many windows have two largest values or more.
+            let whole = |seed, len| numbers(seed, len).iter().map(|v| v.round()).collect::<Vec<f32>>();
+            let (x, weight, bias) = (whole(3, n * c * h * w), whole(4, oc * c * k * k), whole(5, oc));
+            let mut map = nans(n * oc * shape.out_pixels());
+            reference::conv_forward(&shape, n, &x, &weight, &bias, &mut map);
+            let mut max = nans(n * oc * out_h * out_w);
+            reference::max_forward(&pool_shape, n, &map, &mut max);
+            let mut first = Vec::new();
+            for (plane, max) in map.chunks_exact(shape.out_pixels()).zip(max.chunks_exact(out_h * out_w)) {
+                for (at, max) in max.iter().enumerate() {
+                    let (top, left) = (at / out_w * 4, at % out_w * 4);
+                    let mut places = (0..16).map(|place| (top + place / 4, left + place % 4));
+                    let (row, column) =
+                        places.find(|(row, column)| plane[row * shape.out_w() + column] == *max).unwrap();
+                    first.push((row * w + column) as u32);
+                }
+            }
 
-            let (x, weight) = (numbers(3, n * c * h * w), numbers(4, oc * c * k * k));
+            let conv = PooledConv::new(shape, isa).unwrap();
+            let (mut packed, mut scratch) = (nans(conv.packed_len()), nans(conv.scratch_len()));
+            conv.pack(&weight, &bias, &mut packed);
+            let (mut y, mut argmax) = (nans(max.len()), vec![u32::MAX; max.len()]);
+            conv.forward(n, &x, &packed, &mut y, &mut argmax, &mut scratch);
+            failures.compare(&format!("maximum {what}"), &y, &max, 0.0);
+            assert_eq!(argmax, first, "{what}");
+            let mut y = nans(max.len());
+            conv.forward(n, &x, &packed, &mut y, &mut [], &mut scratch);
+            failures.compare(&format!("maximum alone {what}"), &y, &max, 0.0);
+
+            let dpooled = numbers(2, max.len());
             let (mut dweight, mut dbias) = (numbers(5, weight.len()), numbers(6, oc));
             let (mut actual_dweight, mut actual_dbias) = (dweight.clone(), dbias.clone());
-            let (mut dx, mut actual_dx) = (nans(x.len()), nans(x.len()));
+            let (mut dmap, mut dx, mut actual_dx) = (nans(map.len()), nans(x.len()), nans(x.len()));
+            reference::max_backward(&pool_shape, n, &map, &max, &dpooled, &mut dmap);
             reference::conv_backward_weight(&shape, n, &x, &dmap, &mut dweight, &mut dbias);
             reference::conv_backward_input(&shape, n, &dmap, &weight, &mut dx);
-            let conv = Conv::new(shape, isa);
-            assert!(conv.has_sparse_gradients());
-            conv.sparse_backward_weight(n, &x, &argmax, &dpooled, &mut actual_dweight, &mut actual_dbias);
-            conv.sparse_backward_input(n, &argmax, &dpooled, &weight, &mut actual_dx);
+            conv.backward_weight(n, &x, &argmax, &dpooled, &mut actual_dweight, &mut actual_dbias);
+            conv.backward_input(n, &argmax, &dpooled, &weight, &mut actual_dx);
             failures.compare(&format!("weight {what}"), &actual_dweight, &dweight, 1e-5);
             failures.compare(&format!("bias {what}"), &actual_dbias, &dbias, 1e-5);
             failures.compare(&format!("input {what}"), &actual_dx, &dx, 1e-5);

@@ -1,6 +1,7 @@
 //! A NaN in the input: what the docs of each kernel say.
 
 use super::isas;
+use steersman_kernels::conv::{ConvShape, PooledConv};
 use steersman_kernels::norm_rectify::{self, ChannelMeans, ChannelStatistics, RectifyShape, Slopes};
 use steersman_kernels::pool::{self, PoolShape};
 use steersman_kernels::{Isa, activation};
@@ -61,27 +62,41 @@ fn max_pooling_skips_nan_and_average_pooling_passes_it_on() {
 }
 
 #[test]
-fn max_pooling_with_argmax_skips_nan_below_the_upper_row() {
-    let shape = PoolShape { c: 1, h: 4, w: 8, kh: 4, kw: 4, stride_h: 4, stride_w: 4 };
-    let window = |nans: &[usize]| {
-        let mut x: Vec<f32> = (0..32).map(|i| (i * 7 % 32) as f32).collect();
-        nans.iter().for_each(|&at| x[at] = NAN);
-        x
+fn a_pooled_convolution_skips_nan_but_in_the_upper_left_place() {
+    let [pad_top, pad_bottom, pad_left, pad_right] = [0; 4];
+    let (stride_h, stride_w) = (1, 1);
+    let shape = ConvShape {
+        c: 1,
+        h: 6,
+        w: 10,
+        oc: 1,
+        kh: 3,
+        kw: 3,
+        stride_h,
+        stride_w,
+        pad_top,
+        pad_bottom,
+        pad_left,
+        pad_right,
     };
+    // Only the first weight is not 0, but 0 times NaN is NaN too: a NaN spoils the places whose kernels lie over it.
+    let weight: Vec<f32> = (0..9).map(|tap| if tap == 0 { 1.0 } else { 0.0 }).collect();
     for isa in isas() {
-        let run = |x: &[f32]| {
-            let (mut y, mut argmax) = ([0.5; 2], [99; 2]);
-            pool::max_forward_with_argmax(isa, &shape, 1, 8, x, &mut y, &mut argmax);
+        let conv = PooledConv::new(shape, isa).unwrap();
+        let (mut packed, mut scratch) = (vec![0.0; conv.packed_len()], vec![0.0; conv.scratch_len()]);
+        conv.pack(&weight, &[0.0], &mut packed);
+        let mut run = |nan: Option<usize>| {
+            let mut x: Vec<f32> = (0..60).map(|i| (i * 7 % 32) as f32).collect();
+            nan.into_iter().for_each(|at| x[at] = NAN);
+            let (mut y, mut argmax) = ([0.5f32; 2], [99; 2]);
+            conv.forward(1, &x, &packed, &mut y, &mut argmax, &mut scratch);
             (y, argmax)
         };
-        // The largest of the left window are 31 at index 9 and 30 at index 18 (`7 i mod 32`).
-        let (y, argmax) = run(&window(&[]));
-        assert_eq!((y[0], argmax[0]), (31.0, 9), "{}", isa.name());
-        let (y, argmax) = run(&window(&[9]));
-        assert_eq!((y[0], argmax[0]), (30.0, 18), "{}: below the upper row it is skipped", isa.name());
-        let (y, argmax) = run(&window(&[1]));
-        assert_eq!((y[0], argmax[0]), (30.0, 18), "{}: in the upper row it hides its column", isa.name());
-        let (y, argmax) = run(&window(&[0]));
+        // Place (row, column) of the map is `7 (10 row + column) mod 32`: 27 at (1, 3) and 29 at (2, 7) are the largest.
+        assert_eq!(run(None), ([27.0, 29.0], [13, 27]), "{}", isa.name());
+        // The kernels at (2, 7) and (3, 7) lie over the NaN. The next is 28, at (0, 4) and (3, 6).
+        assert_eq!(run(Some(49)), ([27.0, 28.0], [13, 4]), "{}", isa.name());
+        let (y, argmax) = run(Some(0));
         assert!(y[0].is_nan() && argmax[0] == 0 && !y[1].is_nan(), "{}: {y:?} {argmax:?}", isa.name());
     }
 }

@@ -101,6 +101,19 @@ impl Thumbnail {
         Self(cells)
     }
 
+    /// Number of cells.
+    pub(super) const LEN: usize = THUMBNAIL;
+
+    /// Its cells.
+    pub(super) fn cells(&self) -> &[u8] {
+        &*self.0
+    }
+
+    /// One with these cells, [`LEN`](Thumbnail::LEN) many.
+    pub(super) fn of_cells(cells: &[u8]) -> Option<Self> {
+        cells.try_into().ok().map(|cells| Self(Box::new(cells)))
+    }
+
     fn total(&self) -> u32 {
         self.0.iter().map(|&cell| u32::from(cell)).sum()
     }

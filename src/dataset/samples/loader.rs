@@ -19,9 +19,11 @@ use crate::picture::{RgbImage, decode::decode_rgb};
 use crate::{Error, Result};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
+use std::ops::Range;
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 
 mod sample;
+mod share;
 
 /// Everything that decides what batches look like.
 #[derive(Debug, Clone, PartialEq)]
@@ -56,11 +58,13 @@ pub struct SampleId {
 /// Samples for one step. The buffers are reused from batch to batch.
 #[derive(Debug, Clone, Default)]
 pub struct Batch {
-    /// Network input, `[n][c][h][w]`.
+    /// Network input, `[share][c][h][w]`.
     pub x: Vec<f32>,
-    /// Labels, `[n][outputs]`: steering with the corrections of camera and shift, + = right, not clamped; then the others of the row,
+    /// Labels, `[share][outputs]`: steering with the corrections of camera and shift, + = right, not clamped; then the others of the row,
     /// as they are.
     pub labels: Vec<f32>,
+    /// Which of its samples `x` and `labels` hold: all, unless other processes have a share of the batch.
+    pub share: Range<usize>,
     /// Number of samples; less than asked for at the end of an epoch, and where images cannot be decoded.
     pub n: usize,
     /// Where each sample comes from, `[n]`.
@@ -70,6 +74,9 @@ pub struct Batch {
     /// What it is to hold; kept to be used again.
     work: Vec<Wanted>,
 }
+
+/// Which of so many samples are those of this process, if there are pairs among them or not.
+pub type ShareOf<'a> = &'a dyn Fn(usize, bool) -> Range<usize>;
 
 /// Makes the batches of one side of a split.
 #[derive(Debug)]
@@ -353,6 +360,20 @@ impl Loader {
     /// # Panics
     /// If there is no such batch.
     pub fn fill(&self, batch: usize, out: &mut Batch) -> Result<()> {
+        let whole = |n: usize, _: bool| 0..n;
+        let complete = self.fill_share(batch, out, &whole)?;
+        self.settle(out, complete, &whole)
+    }
+
+    /// The first half of [`fill`](Loader::fill), where this process has but a share of the batch: `share` says which of so many samples,
+    /// with pairs among them or not. Answers whether all samples of the share could be decoded. [`settle`](Loader::settle) must follow.
+    ///
+    /// # Errors
+    /// As [`fill`](Loader::fill).
+    ///
+    /// # Panics
+    /// As [`fill`](Loader::fill).
+    pub fn fill_share(&self, batch: usize, out: &mut Batch, share: ShareOf) -> Result<bool> {
         let per_batch = self.per_batch();
         let taken = &self.order[batch * per_batch..self.order.len().min((batch + 1) * per_batch)];
         let variants = self.variants() as u32;
@@ -368,19 +389,12 @@ impl Loader {
                 }
             }
         }
-        let len = self.spec.preprocessing.output_len();
         out.n = out.work.len();
-        out.x.resize(out.n * len, 0.0);
-        let outputs = self.targets.outputs();
-        out.labels.resize(out.n * outputs, 0.0);
-        let labels = out.labels.par_chunks_exact_mut(outputs);
-        let samples = out.x.par_chunks_exact_mut(len).zip(labels).zip(&mut out.work);
-        samples.try_for_each(|((x, labels), wanted)| -> Result<()> {
-            wanted.decoded = self.with_scratch(|scratch| self.make_sample(wanted, x, labels, scratch))??;
-            Ok(())
-        })?;
-        self.close_gaps(out);
-        Ok(())
+        // Those of the others count as decoded until `settle` knows better.
+        out.work.iter_mut().for_each(|wanted| wanted.decoded = true);
+        out.share = share(out.n, out.pairs.images() > 0);
+        self.make_samples(out)?;
+        Ok(out.work[out.share.clone()].iter().all(|wanted| wanted.decoded))
     }
 
     /// Images that could not be decoded so far: their number, and the first few with their paths.
@@ -449,6 +463,7 @@ impl Loader {
         let (len, outputs) = (self.spec.preprocessing.output_len(), self.targets.outputs());
         let mut n = 0;
         out.samples.clear();
+        let whole = out.share == (0..out.n);
         let pairs = out.pairs;
         for i in 0..out.n {
             let Wanted { sample, draws, decoded, .. } = out.work[i];
@@ -468,8 +483,11 @@ impl Loader {
             n += 1;
         }
         out.n = n;
-        out.x.truncate(n * len);
-        out.labels.truncate(n * outputs);
+        if whole {
+            out.share = 0..n;
+            out.x.truncate(n * len);
+            out.labels.truncate(n * outputs);
+        }
     }
 
     /// Runs `work` with buffers that no other thread uses.

@@ -68,7 +68,7 @@ impl<'a> StepContext<'a> {
         let len = self.plan.stages[stage].input_len(self.network);
         match self.plan.stages[stage].source {
             Some(source) => &activations[source][(images.start - first) * len..][..images.len() * len],
-            None => &self.input.x[images.start * len..images.end * len],
+            None => self.input.images(images, len),
         }
     }
 
@@ -101,9 +101,9 @@ impl<'a> StepContext<'a> {
         let outputs = self.network.output().len();
         let predictions = match shard.buffers.activations.last() {
             Some(last) => &last[..images.len() * outputs],
-            None => &self.input.x[images.start * outputs..images.end * outputs],
+            None => self.input.images(images.clone(), outputs),
         };
-        let labels = &self.input.labels[images.start * outputs..images.end * outputs];
+        let labels = self.input.labels(images.clone(), outputs);
         let count = self.loss_count();
         let scale = 1.0 / count as f32;
         let gradient = &mut shard.buffers.d_output[..predictions.len()];
@@ -122,8 +122,8 @@ impl<'a> StepContext<'a> {
 
     /// What the sum of the losses of the batch is divided by: the number of labels, or of images if the outputs have weights.
     pub fn loss_count(&self) -> usize {
-        let labels = self.input.labels.len();
-        if self.plan.output_weights.is_empty() { labels } else { labels / self.plan.output_weights.len() }
+        let images = self.input.of;
+        if self.plan.output_weights.is_empty() { images * self.network.output().len() } else { images }
     }
 
     /// Backward pass of `stages`: from the gradient of the last one's output to that of the first one's input.

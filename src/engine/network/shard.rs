@@ -3,6 +3,8 @@
 use std::ops::Range;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
+use steersman_kernels::{Isa, update};
+
 use super::Network;
 
 /// A part of the batch with a gradient of its own, worked on by one thread at a time.
@@ -16,12 +18,15 @@ pub(super) struct Shard {
     pub scratch: Vec<f32>,
     /// The image whose activations come first in the buffers.
     pub first: usize,
+    /// Empty unless it holds the gradient of this shard, or of a subtree that begins with it.
     pub gradient: Vec<f32>,
     pub sums: Vec<f64>,
     /// The same of the images that are being worked on.
     pub group_sums: Vec<f64>,
     /// Sum of the losses of all images.
     pub loss: f64,
+    /// Of the parameters, those whose gradient is being computed.
+    pub learning: Range<usize>,
 }
 
 /// The activations and gradients of a shard. In a network with a barrier each shard keeps its own, because they outlive the barrier;
@@ -63,9 +68,27 @@ impl<T> Spare<T> {
 }
 
 impl Shard {
-    pub fn reset(&mut self) {
-        self.gradient.fill(0.0);
-        self.loss = 0.0;
+    /// Takes a gradient, unless it has one, and sets that of the parameters `learning` to 0.
+    pub fn begin_gradient(&mut self, spare_gradients: &Spare<Vec<f32>>, learning: Range<usize>) {
+        if self.gradient.is_empty() {
+            self.gradient = spare_gradients.take();
+        }
+        self.gradient[learning.clone()].fill(0.0);
+        self.learning = learning;
+    }
+
+    /// Adds the gradient of the next shards to this one's, and gives their buffer back.
+    pub fn add_gradient(&mut self, next: &mut Shard, isa: Isa, spare_gradients: &Spare<Vec<f32>>) {
+        let learning = self.learning.clone();
+        update::sum_into(isa, &mut self.gradient[learning.clone()], &next.gradient[learning]);
+        spare_gradients.put(std::mem::take(&mut next.gradient));
+    }
+
+    /// Adds the first `len` batch-norm sums of the next shards to this one's.
+    pub fn add_sums(&mut self, next: &Shard, len: usize) {
+        for (sum, next) in self.sums[..len].iter_mut().zip(&next.sums) {
+            *sum += next;
+        }
     }
 
     /// Takes scratch for the images between two barriers.
@@ -97,16 +120,4 @@ impl Shard {
 /// `images`, `group` at a time.
 pub(super) fn groups(images: Range<usize>, group: usize) -> impl Iterator<Item = Range<usize>> {
     images.clone().step_by(group).map(move |start| start..(start + group).min(images.end))
-}
-
-/// Adds the shards' sums up, in their order.
-pub(super) fn total<'a>(shards: &[Shard], len: usize, sums: &'a mut [f64]) -> &'a [f64] {
-    let sums = &mut sums[..len];
-    sums.fill(0.0);
-    for shard in shards {
-        for (total, sum) in sums.iter_mut().zip(&shard.sums) {
-            *total += sum;
-        }
-    }
-    sums
 }

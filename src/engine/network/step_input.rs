@@ -1,5 +1,7 @@
 //! The batch of one training step.
 
+use std::ops::Range;
+
 use ndarray::{ArrayView1, ArrayView4};
 
 use super::Network;
@@ -30,6 +32,22 @@ pub(super) struct StepSlices<'a> {
     pub seed: u64,
     pub step: u64,
     pub pairs: PairTerms,
+    /// The image of the batch that comes first in `x`: not 0 where other processes have images before it.
+    pub first: usize,
+    /// Number of images of the whole batch.
+    pub of: usize,
+}
+
+impl<'a> StepSlices<'a> {
+    /// The `images` of the batch, `len` numbers each.
+    pub fn images(&self, images: Range<usize>, len: usize) -> &'a [f32] {
+        &self.x[(images.start - self.first) * len..(images.end - self.first) * len]
+    }
+
+    /// Their labels, `outputs` each.
+    pub fn labels(&self, images: Range<usize>, outputs: usize) -> &'a [f32] {
+        &self.labels[(images.start - self.first) * outputs..(images.end - self.first) * outputs]
+    }
 }
 
 impl<'a> StepInput<'a> {
@@ -42,7 +60,7 @@ impl<'a> StepInput<'a> {
         let (x, n) = (image_slice(network, self.x), self.x.len_of(ndarray::Axis(0)));
         let labels = self.labels.to_slice().expect("labels must be contiguous");
         assert_eq!(labels.len(), n * network.output().len(), "labels for a batch of {n} images");
-        StepSlices { x, labels, seed: self.seed, step: self.step, pairs: PairTerms::default() }
+        StepSlices { x, labels, seed: self.seed, step: self.step, pairs: PairTerms::default(), first: 0, of: n }
     }
 }
 

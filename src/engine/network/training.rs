@@ -1,22 +1,27 @@
 //! A training step: forward, loss, backward, over fixed shards of the batch.
 //!
-//! The batch is cut into at most [`MAX_SHARDS`] shards whose borders depend on the batch size alone. Each shard has a
-//! gradient arena of its own and is worked on by one thread; scratch, and without a barrier the activations too, are borrowed from a
-//! pool. Gradients and batch-norm sums are added in the order of the shards. So the result has the same bits for any number of
-//! threads.
+//! The batch is cut into shards whose borders depend on the batch size alone. Each shard is worked on by one thread; scratch, the
+//! gradient, and without a barrier the activations too, are borrowed from a pool. Losses, gradients and batch-norm sums are added along
+//! a fixed binary tree over the shards: two neighbours as soon as both are there, so that few gradients are held at a time. The result
+//! has the same bits for any number of threads, and of processes: see [`Ranks`].
 //!
 //! Between two batch-norm barriers a shard takes a group of a few images through all layers, so that the output of one layer is
 //! still in the cache when the next layer reads it. A network without batch norm has no barrier: each group goes forward *and*
 //! backward, and the buffers hold one group only.
 
 use std::ops::Range;
+use std::sync::Arc;
 
+use ndarray::Axis;
 use rayon::prelude::*;
 use steersman_kernels::{Isa, update};
 
 use super::fused::{FusedStage, replaces_input, stages};
 use super::passes::{StagePlan, StepContext};
-use super::shard::{Buffers, Shard, Spare, groups, total};
+use super::ranks::Ranks;
+use super::reduction::Reduction;
+use super::shard::{Buffers, Shard, Spare, groups};
+use super::shard_tree::{Sharding, sum_subtrees};
 use super::step_input::{StepInput, StepSlices};
 use super::step_profile::{StageTime, StepTimes};
 use super::{Network, Parameters};
@@ -24,12 +29,6 @@ use crate::engine::layers::BatchStatistics;
 use crate::engine::loss::{Loss, PairTerms};
 use crate::engine::parameters::CHUNK;
 use crate::engine::stopwatch::Stopwatch;
-
-/// Upper limit of the shards of a batch: enough to keep 16 threads busy.
-const MAX_SHARDS: usize = 16;
-
-/// Batches with pairs need a plan for a multiple of so many images: each shard then has room for an even number.
-pub const PAIRS_CAPACITY: usize = 2 * MAX_SHARDS;
 
 /// Limits of a group: the images that a shard takes through the layers at a time.
 #[derive(Clone, Copy, Debug)]
@@ -55,6 +54,8 @@ pub struct TrainingPlan {
     spare_buffers: Spare<Buffers>,
     /// The scratch that no shard is using.
     spare_scratch: Spare<Vec<f32>>,
+    /// The gradients that no shard is using.
+    spare_gradients: Spare<Vec<f32>>,
     /// Gradient of the mean loss with respect to [`Parameters::values`].
     gradient: Vec<f32>,
     /// Sum of squares of each chunk of the gradient.
@@ -67,6 +68,9 @@ pub struct TrainingPlan {
     segments: Vec<Range<usize>>,
     /// Size of a group in each segment.
     segment_groups: Vec<usize>,
+    /// The parameters of each segment.
+    learning: Vec<Range<usize>>,
+    reduction: Reduction,
     capacity: usize,
     /// Outputs of the network.
     outputs: usize,
@@ -110,7 +114,9 @@ impl TrainingPlan {
         let largest = gradients.map(|(_, stage)| stage.input_len(network)).chain([network.output().len()]).max();
         let largest = largest.unwrap_or(0);
 
-        let shard_capacity = capacity.div_ceil(MAX_SHARDS).max(1);
+        // Pairs make the shards even.
+        let shard_capacity = Sharding::new(capacity, true).shard_images().min(capacity.max(1));
+        let shard_count = (1..=capacity).map(|images| Sharding::new(images, false).count()).max().unwrap_or(0);
         let group = if segments.len() > 1 {
             shard_capacity
         } else {
@@ -121,7 +127,7 @@ impl TrainingPlan {
             .map(|images| images.min(shard_capacity))
             .collect();
         let scratch_len = stages.iter().map(|stage| stage.scratch_len(network, group)).max().unwrap_or(0);
-        let mut spare: Vec<Buffers> = (0..capacity.min(MAX_SHARDS))
+        let mut spare: Vec<Buffers> = (0..shard_count)
             .map(|_| Buffers {
                 activations: stages.iter().map(|stage| vec![0.0; group * stage.output_len(network)]).collect(),
                 argmax: stages.iter().map(|stage| vec![0; stage.argmax_len(network) * group]).collect(),
@@ -130,22 +136,32 @@ impl TrainingPlan {
                 in_place: false,
             })
             .collect();
-        let shards = (0..capacity.min(MAX_SHARDS))
+        let shards = (0..shard_count)
             .map(|_| Shard {
                 images: 0..0,
                 buffers: if segments.len() > 1 { spare.pop().unwrap_or_default() } else { Buffers::default() },
                 scratch: Vec::new(),
-                gradient: vec![0.0; network.count(true)],
+                gradient: Vec::new(),
                 first: 0,
                 sums: vec![0.0; sums_len],
                 group_sums: vec![0.0; sums_len],
                 loss: 0.0,
+                learning: 0..0,
             })
             .collect();
+        let learning = segments.iter().map(|segment| match &stages[segment.clone()] {
+            [] => 0..0,
+            [first, .., last] => first.params(network).start..last.params(network).end,
+            [only] => only.params(network),
+        });
         TrainingPlan {
+            learning: learning.collect(),
+            reduction: Reduction::new(None),
             shards,
             spare_buffers: Spare::new(spare),
-            spare_scratch: Spare::new((0..capacity.min(MAX_SHARDS)).map(|_| vec![0.0; scratch_len]).collect()),
+            spare_scratch: Spare::new((0..shard_count).map(|_| vec![0.0; scratch_len]).collect()),
+            // A buffer that was never used takes no memory.
+            spare_gradients: Spare::new((0..shard_count).map(|_| vec![0.0; network.count(true)]).collect()),
             gradient: vec![0.0; network.count(true)],
             chunk_squares: vec![0.0; network.count(true).div_ceil(CHUNK)],
             plan: StagePlan {
@@ -181,6 +197,16 @@ impl TrainingPlan {
         assert_eq!(weights.len(), self.outputs, "a weight for each output of the network");
         self.plan.output_weights = weights.to_vec();
         self
+    }
+
+    /// The same, for the share of one of several processes that train together.
+    pub fn with_ranks(mut self, ranks: Arc<dyn Ranks>) -> TrainingPlan {
+        self.set_ranks(ranks);
+        self
+    }
+
+    pub(crate) fn set_ranks(&mut self, ranks: Arc<dyn Ranks>) {
+        self.reduction = Reduction::new(Some(ranks));
     }
 
     /// Gradient of the mean loss of the last step with respect to [`Parameters::values`].
@@ -224,8 +250,7 @@ impl TrainingPlan {
     ///
     /// # Panics
     ///
-    /// As [`step`](TrainingPlan::step); also if there are pairs and the plan was made for a capacity that is no multiple of
-    /// [`PAIRS_CAPACITY`].
+    /// As [`step`](TrainingPlan::step).
     pub fn step_with_pairs(
         &mut self,
         network: &Network,
@@ -234,59 +259,88 @@ impl TrainingPlan {
         pairs: &PairTerms,
         input: StepInput,
     ) -> f64 {
-        let (input, used) = self.begin_step(network, parameters, pairs, input);
-        if self.segments.len() == 1 {
-            self.step_without_barriers(network, parameters, loss, input, used);
-        } else {
-            self.forward_with_barriers(network, parameters, Some(loss), input, used);
-            self.backward_with_barriers(network, parameters, input, used);
-        }
-        self.reduce_gradient(network, used);
-        let count = input.labels.len() / self.plan.output_weights.len().max(1);
-        self.shards[..used].iter().map(|shard| shard.loss).sum::<f64>() / count as f64
+        let of = input.x.len_of(Axis(0));
+        self.step_of_share(network, parameters, loss, pairs, input, of)
     }
 
-    /// Lets the running statistics go on over one batch as [`step`](TrainingPlan::step) does, and changes nothing else: the forward
-    /// pass alone, as far as the last batch normalisation. Without any it does nothing.
+    /// As [`step_with_pairs`](TrainingPlan::step_with_pairs), on all ranks at once: `input` has the images of this process's
+    /// [`share`](super::share) of a batch of `of` images. The result, in all ranks, is that of the whole batch.
     ///
     /// # Panics
     ///
-    /// As [`step`](TrainingPlan::step).
-    pub fn pass_statistics(&mut self, network: &Network, parameters: &mut Parameters, input: StepInput) {
+    /// As [`step`](TrainingPlan::step), also if the images are not as many as the share has.
+    pub fn step_of_share(
+        &mut self,
+        network: &Network,
+        parameters: &mut Parameters,
+        loss: &Loss,
+        pairs: &PairTerms,
+        input: StepInput,
+        of: usize,
+    ) -> f64 {
+        let (input, used) = self.begin_step(network, parameters, pairs, input, of);
+        if self.segments.len() == 1 {
+            self.lend_gradient(used);
+            self.step_without_barriers(network, parameters, loss, input, used);
+        } else {
+            self.forward_with_barriers(network, parameters, Some(loss), input, used);
+            self.lend_gradient(used);
+            self.backward_with_barriers(network, parameters, input, used);
+        }
+        self.reduce_gradient(network, used);
+        let mut total = [0.0];
+        self.reduction.sum(&self.shards[..used], |shard| std::slice::from_ref(&shard.loss), &mut total);
+        let StepSlices { of, .. } = input;
+        let count = if self.plan.output_weights.is_empty() { of * self.outputs } else { of };
+        total[0] / count as f64
+    }
+
+    /// Lets the running statistics go on over one batch as [`step`](TrainingPlan::step) does, and changes nothing else: the forward
+    /// pass alone, as far as the last batch normalisation. Without any it does nothing. `input` and `of` are as in
+    /// [`step_of_share`](TrainingPlan::step_of_share).
+    ///
+    /// # Panics
+    ///
+    /// As [`step_of_share`](TrainingPlan::step_of_share).
+    pub fn pass_statistics(&mut self, network: &Network, parameters: &mut Parameters, input: StepInput, of: usize) {
         if self.segments.len() > 1 {
-            let (input, used) = self.begin_step(network, parameters, &PairTerms::default(), input);
+            let (input, used) = self.begin_step(network, parameters, &PairTerms::default(), input, of);
             self.forward_with_barriers(network, parameters, None, input, used);
         }
     }
 
-    /// Cuts the batch into shards and packs the weights; returns the batch and the number of its shards.
+    /// Cuts the batch into shards and packs the weights; returns the images of this process and the number of their shards.
     fn begin_step<'a>(
         &mut self,
         network: &Network,
         parameters: &Parameters,
         pairs: &PairTerms,
         input: StepInput<'a>,
+        of: usize,
     ) -> (StepSlices<'a>, usize) {
         assert_eq!(self.fingerprint, network.fingerprint(), "a training plan for another network");
         network.check_parameters(parameters);
-        let input = StepSlices { pairs: *pairs, ..input.slices(network) };
+        assert!(of > 0 && of <= self.capacity, "a batch of {of} images in a plan for 1 to {}", self.capacity);
+        assert!(pairs.images() <= of, "{} images in pairs in a batch of {of}", pairs.images());
+        self.reduction.begin(Sharding::new(of, pairs.images() > 0));
+        let own = self.reduction.own_images();
+        let input = StepSlices { pairs: *pairs, first: own.start, of, ..input.slices(network) };
         let n = input.x.len() / network.input().len();
-        assert!(n > 0 && n <= self.capacity, "a batch of {n} images in a plan for 1 to {}", self.capacity);
-
-        assert!(pairs.images() <= n, "{} images in pairs in a batch of {n}", pairs.images());
-        let mut shard_images = n.div_ceil(MAX_SHARDS);
-        if pairs.images() > 0 {
-            // A pair stays in one shard.
-            assert!(self.capacity.is_multiple_of(PAIRS_CAPACITY), "pairs in a plan for {} images", self.capacity);
-            shard_images = shard_images.next_multiple_of(2);
-        }
-        let used = n.div_ceil(shard_images);
+        assert_eq!(n, own.len(), "the share of a batch of {of} images");
+        let used = self.reduction.own().len();
         for (index, shard) in self.shards[..used].iter_mut().enumerate() {
-            shard.images = index * shard_images..((index + 1) * shard_images).min(n);
+            shard.images = self.reduction.images_of(index);
         }
         self.freeze_moments(network, parameters);
         self.pack(network, parameters);
         (input, used)
+    }
+
+    /// The first shard adds to the gradient of the plan itself.
+    fn lend_gradient(&mut self, used: usize) {
+        if used > 0 {
+            self.shards[0].gradient = std::mem::take(&mut self.gradient);
+        }
     }
 
     /// Packs the weights once for all shards.
@@ -318,10 +372,11 @@ impl TrainingPlan {
         input: StepSlices,
         used: usize,
     ) {
-        let TrainingPlan { shards, spare_buffers, spare_scratch, plan, moments, .. } = self;
+        let TrainingPlan { shards, spare_buffers, spare_scratch, spare_gradients, plan, moments, isa, .. } = self;
         let run = StepContext { plan, network, parameters, moments, input };
-        shards[..used].par_iter_mut().for_each(|shard| {
-            shard.reset();
+        let work = |shard: &mut Shard| {
+            shard.loss = 0.0;
+            shard.begin_gradient(spare_gradients, 0..network.count(true));
             shard.buffers = spare_buffers.take();
             shard.scratch = spare_scratch.take();
             let mut group = shard.group_capacity(network);
@@ -336,7 +391,12 @@ impl TrainingPlan {
             }
             spare_buffers.put(std::mem::take(&mut shard.buffers));
             spare_scratch.put(std::mem::take(&mut shard.scratch));
-        });
+        };
+        let add = |shard: &mut Shard, next: &mut Shard| {
+            plan.times.reduce.time(|| shard.add_gradient(next, *isa, spare_gradients));
+            shard.loss += next.loss;
+        };
+        sum_subtrees(&mut shards[..used], self.reduction.own_roots(), &work, &add);
     }
 
     /// Without a loss it ends at the last barrier.
@@ -348,18 +408,16 @@ impl TrainingPlan {
         input: StepSlices,
         used: usize,
     ) {
-        let TrainingPlan { shards, spare_scratch, plan, moments, sums, segments, segment_groups, .. } = self;
+        let TrainingPlan { shards, spare_scratch, plan, moments, sums, segments, segment_groups, reduction, .. } = self;
         let shards = &mut shards[..used];
-        let images = shards.last().map_or(0, |shard| shard.images.end);
         let barrier = |stage: usize| barrier_of(&plan.stages, network, stage);
         let wanted = segments.len() - usize::from(loss.is_none());
         for (index, segment) in segments[..wanted].iter().enumerate() {
             let run = StepContext { plan, network, parameters, moments, input };
             let next_barrier = segments.get(index + 1).map(|next| next.start);
-            shards.par_iter_mut().for_each(|shard| {
-                if index == 0 {
-                    shard.reset();
-                }
+            let sums_len = next_barrier.map_or(0, |stage| barrier(stage).sums_len());
+            let work = |shard: &mut Shard| {
+                shard.loss = 0.0;
                 shard.begin_segment(spare_scratch);
                 for images in groups(shard.images.clone(), segment_groups[index]) {
                     run.forward(segment.clone(), shard, images.clone());
@@ -371,13 +429,19 @@ impl TrainingPlan {
                     run.loss(loss, shard, shard.images.clone());
                 }
                 spare_scratch.put(std::mem::take(&mut shard.scratch));
-            });
+            };
+            let add = |shard: &mut Shard, next: &mut Shard| {
+                shard.add_sums(next, sums_len);
+                shard.loss += next.loss;
+            };
+            sum_subtrees(shards, reduction.own_roots(), &work, &add);
             if let Some(stage) = next_barrier {
                 let layer = &network.layers()[plan.stages[stage].layers.start];
-                let sums = total(shards, barrier(stage).sums_len(), sums);
+                let sums = &mut sums[..sums_len];
+                reduction.sum(shards, |shard| &shard.sums, sums);
                 barrier(stage).finish_forward(
                     &parameters.values[layer.params.clone()],
-                    images,
+                    input.of,
                     sums,
                     &mut moments[plan.moments_of[stage].clone()],
                     &mut parameters.statistics[layer.statistics.clone()],
@@ -387,16 +451,19 @@ impl TrainingPlan {
     }
 
     fn backward_with_barriers(&mut self, network: &Network, parameters: &Parameters, input: StepSlices, used: usize) {
-        let TrainingPlan { shards, spare_scratch, plan, moments, sums, segments, segment_groups, .. } = self;
+        let TrainingPlan { shards, spare_scratch, spare_gradients, plan, moments, sums, segments, .. } = self;
+        let (segment_groups, learning, reduction, isa) =
+            (&self.segment_groups, &self.learning, &mut self.reduction, self.isa);
         let shards = &mut shards[..used];
-        let images = shards.last().map_or(0, |shard| shard.images.end);
         let barrier = |stage: usize| barrier_of(&plan.stages, network, stage);
         let last = segments.len() - 1;
         for (index, segment) in segments.iter().enumerate().rev() {
             let run = StepContext { plan, network, parameters, moments, input };
             // The stage at the start of a segment waits for the sums over all shards.
             let rest = if index > 0 { segment.start + 1..segment.end } else { segment.clone() };
-            shards.par_iter_mut().for_each(|shard| {
+            let sums_len = if index > 0 { barrier(segment.start).sums_len() } else { 0 };
+            let work = |shard: &mut Shard| {
+                shard.begin_gradient(spare_gradients, learning[index].clone());
                 shard.begin_segment(spare_scratch);
                 let in_place = shard.buffers.in_place;
                 for images in groups(shard.images.clone(), segment_groups[index]) {
@@ -411,29 +478,39 @@ impl TrainingPlan {
                     }
                 }
                 spare_scratch.put(std::mem::take(&mut shard.scratch));
-            });
+            };
+            let add = |shard: &mut Shard, next: &mut Shard| {
+                plan.times.reduce.time(|| shard.add_gradient(next, isa, spare_gradients));
+                shard.add_sums(next, sums_len);
+            };
+            sum_subtrees(shards, reduction.own_roots(), &work, &add);
             if index > 0 {
                 let stage = segment.start;
-                let sums = total(shards, barrier(stage).sums_len(), sums);
+                let sums = &mut sums[..sums_len];
+                reduction.sum(shards, |shard| &shard.sums, sums);
                 let params = &parameters.values[network.layers()[plan.stages[stage].layers.start].params.clone()];
                 let moments = &mut moments[plan.moments_of[stage].clone()];
-                barrier(stage).finish_backward(params, images, sums, moments);
+                barrier(stage).finish_backward(params, input.of, sums, moments);
             }
         }
     }
 
-    /// Adds the shards' gradients in the order of the shards. The gradients of frozen layers become 0.
+    /// Takes the gradient back, adds those of the other processes, and takes its sums of squares. The gradients of frozen layers become
+    /// 0.
     fn reduce_gradient(&mut self, network: &Network, used: usize) {
-        let TrainingPlan { shards, gradient, chunk_squares, isa, plan, .. } = self;
-        let shards = &shards[..used];
+        let TrainingPlan { shards, spare_gradients, gradient, chunk_squares, isa, plan, reduction, .. } = self;
+        let shards = &mut shards[..used];
+        if used > 0 {
+            *gradient = std::mem::take(&mut shards[0].gradient);
+        }
+        reduction.sum_gradients(*isa, shards, gradient);
+        for shard in shards.iter_mut().filter(|shard| !shard.gradient.is_empty()) {
+            spare_gradients.put(std::mem::take(&mut shard.gradient));
+        }
         gradient.par_chunks_mut(CHUNK).zip(chunk_squares.par_iter_mut()).enumerate().for_each(
             |(index, (chunk, squares))| {
                 plan.times.reduce.time(|| {
                     let range = index * CHUNK..index * CHUNK + chunk.len();
-                    chunk.copy_from_slice(&shards[0].gradient[range.clone()]);
-                    for shard in &shards[1..] {
-                        update::sum_into(*isa, chunk, &shard.gradient[range.clone()]);
-                    }
                     for layer in network.layers().iter().filter(|layer| layer.frozen) {
                         let (from, to) = (layer.params.start.max(range.start), layer.params.end.min(range.end));
                         if from < to {

@@ -288,9 +288,9 @@ mod tests {
         same(network, what, stages_step, step(network, layer_by_layer(network), 19, GROUP_LIMITS));
     }
 
-    /// Shards of 5 images make the same step with 1 or 2 images at a time as with all.
+    /// Shards of 4 images make the same step with 1 or 2 images at a time as with all.
     fn agrees_in_groups(network: &Network, what: &str) {
-        let all = GroupLimits { segment_numbers: usize::MAX, group_numbers: usize::MAX, min_group: 5 };
+        let all = GroupLimits { segment_numbers: usize::MAX, group_numbers: usize::MAX, min_group: 4 };
         let whole = step(network, stages(network), 80, all);
         for images in [1, 2] {
             let numbers = |limit: usize| images * limit;

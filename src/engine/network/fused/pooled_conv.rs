@@ -1,10 +1,8 @@
 //! Convolution, activation and pooling as one.
 
-use steersman_kernels::activation;
-use steersman_kernels::pool::{self, PoolShape};
-use steersman_kernels::{Isa, conv::Conv};
+use steersman_kernels::{Isa, activation, conv};
 
-use crate::engine::layers::{Conv2d, Grads, Layer, Packing, Pair, Pass};
+use crate::engine::layers::{Conv2d, Grads, Packing, Pair, Pass};
 
 /// A monotonic activation: it commutes with the maximum of a window.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -17,8 +15,8 @@ pub enum MonotonicActivation {
 
 /// What [`Conv2d`], an activation and [`MaxPool`](crate::engine::layers::MaxPool) of 4x4 windows do one after the other.
 ///
-/// The pooling comes first: then the activation has 16 times fewer values to compute, and the maps of the convolution live
-/// in the cache for one image only. The positions of the largest are kept; the gradient is 0 everywhere else, and the
+/// The pooling comes first, in the pass of the convolution: then the activation has 16 times fewer values to compute, and the maps
+/// of the convolution are never written. The positions of the largest are kept; the gradient is 0 everywhere else, and the
 /// convolution's gradients are taken from these positions alone. Parameters are those of the convolution.
 ///
 /// Where the activation rounds different values to the same one (ELU far below 0), the gradient goes to the value that was the
@@ -26,31 +24,21 @@ pub enum MonotonicActivation {
 #[derive(Clone, Debug)]
 pub struct PooledConv {
     conv: Conv2d,
+    kernel: conv::PooledConv,
     activation: MonotonicActivation,
-    pool: PoolShape,
     isa: Isa,
 }
 
 impl PooledConv {
-    /// `conv`, then `activation`, then the maximum of 4x4 windows; `None` where the convolution has no such gradients.
+    /// `conv`, then `activation`, then the maximum of 4x4 windows; `None` where the kernels have no such pass.
     pub fn new(conv: Conv2d, activation: MonotonicActivation, isa: Isa) -> Option<PooledConv> {
-        let output = conv.output();
-        let pool = PoolShape { c: output.c, h: output.h, w: output.w, kh: 4, kw: 4, stride_h: 4, stride_w: 4 };
-        conv.kernel().has_sparse_gradients().then_some(PooledConv { conv, activation, pool, isa })
-    }
-
-    fn kernel(&self) -> &Conv {
-        self.conv.kernel()
-    }
-
-    fn output_len(&self) -> usize {
-        self.pool.c * self.pool.out_h() * self.pool.out_w()
+        let kernel = conv::PooledConv::new(*conv.kernel().shape(), conv.kernel().backend())?;
+        Some(PooledConv { conv, kernel, activation, isa })
     }
 
     /// Length of the scratch buffer that any method needs for `n` images.
     pub fn scratch_len(&self, n: usize) -> usize {
-        let map = self.pool.c * self.pool.h * self.pool.w;
-        (map + self.output_len() + self.kernel().scratch_len()).max(n * self.output_len())
+        n * self.kernel.y_len() + self.kernel.scratch_len()
     }
 
     fn activate(&self, x: &[f32], y: &mut [f32]) {
@@ -61,21 +49,19 @@ impl PooledConv {
     }
 
     /// Overwrites `y`, and `argmax` of the same length: for each output the index, in a plane of the image, of the first element
-    /// of the kernel window that gave the largest value.
+    /// of the kernel window that gave the largest value. An empty `argmax` asks for none.
     ///
     /// # Panics
     ///
     /// If the pass has no [`Pass::packed`]: unlike a layer, it does not pack the weights itself.
     pub fn forward(&self, pass: &Pass, n: usize, x: &[f32], y: &mut [f32], argmax: &mut [u32], scratch: &mut [f32]) {
-        let (map, scratch) = scratch.split_at_mut(self.pool.c * self.pool.h * self.pool.w);
-        let (pooled, scratch) = scratch.split_at_mut(self.output_len());
-        let input = self.conv.input();
-        let outputs = y.chunks_exact_mut(self.output_len()).zip(argmax.chunks_exact_mut(self.output_len()));
-        for (x, (y, argmax)) in x.chunks_exact(input.len()).zip(outputs).take(n) {
-            self.kernel().forward_packed(1, x, pass.packed, map, scratch);
-            pool::max_forward_with_argmax(self.isa, &self.pool, 1, input.w, map, pooled, argmax);
-            self.activate(pooled, y);
-        }
+        self.run(pass.packed, n, x, y, argmax, scratch);
+    }
+
+    fn run(&self, packed: &[f32], n: usize, x: &[f32], y: &mut [f32], argmax: &mut [u32], scratch: &mut [f32]) {
+        let (pooled, scratch) = scratch.split_at_mut(n * self.kernel.y_len());
+        self.kernel.forward(n, x, packed, pooled, argmax, scratch);
+        self.activate(pooled, y);
     }
 
     /// Gradients: overwrites `dx` where it is asked for, adds to the parameters'. `argmax` are those of
@@ -83,15 +69,16 @@ impl PooledConv {
     pub fn backward(&self, params: &[f32], n: usize, pair: Pair, argmax: &[u32], dx: Option<&mut [f32]>, grads: Grads) {
         let Pair { x, y, dy } = pair;
         let Grads { dparams, scratch } = grads;
-        let dz = &mut scratch[..n * self.output_len()];
+        let dz = &mut scratch[..n * self.kernel.y_len()];
         match self.activation {
             MonotonicActivation::Relu => activation::relu_backward(self.isa, y, dy, dz),
             MonotonicActivation::Elu(alpha) => activation::elu_backward(self.isa, alpha, y, dy, dz),
         }
-        let (dweight, dbias) = dparams.split_at_mut(self.conv.split(params).0.len());
-        self.kernel().sparse_backward_weight(n, x, argmax, dz, dweight, dbias);
+        let (weight, _) = self.conv.split(params);
+        let (dweight, dbias) = dparams.split_at_mut(weight.len());
+        self.kernel.backward_weight(n, x, argmax, dz, dweight, dbias);
         if let Some(dx) = dx {
-            self.kernel().sparse_backward_input(n, argmax, dz, self.conv.split(params).0, dx);
+            self.kernel.backward_input(n, argmax, dz, weight, dx);
         }
     }
 }
@@ -99,29 +86,23 @@ impl PooledConv {
 /// Evaluation: the weights are those of the convolution.
 impl Packing for PooledConv {
     fn packed_len(&self) -> usize {
-        self.conv.packed_len()
+        self.kernel.packed_len()
     }
 
     fn pack(&self, params: &[f32], packed: &mut [f32]) {
-        self.conv.pack(params, packed);
+        let (weight, bias) = self.conv.split(params);
+        self.kernel.pack(weight, bias, packed);
     }
 
     fn training_packed_len(&self) -> usize {
-        self.conv.packed_len()
+        self.packed_len()
     }
 
     fn pack_for_training(&self, params: &[f32], packed: &mut [f32]) {
-        self.conv.pack(params, packed);
+        self.pack(params, packed);
     }
 
     fn infer_packed(&self, packed: &[f32], n: usize, x: &[f32], y: &mut [f32], scratch: &mut [f32]) {
-        let (map, scratch) = scratch.split_at_mut(self.pool.c * self.pool.h * self.pool.w);
-        let (pooled, scratch) = scratch.split_at_mut(self.output_len());
-        let images = x.chunks_exact(self.conv.input().len()).zip(y.chunks_exact_mut(self.output_len()));
-        for (x, y) in images.take(n) {
-            self.conv.infer_packed(packed, 1, x, map, scratch);
-            pool::max_forward(self.isa, &self.pool, 1, map, pooled);
-            self.activate(pooled, y);
-        }
+        self.run(packed, n, x, y, &mut [], scratch);
     }
 }

@@ -1,0 +1,33 @@
+//! What the ranks other than 0 do: they carry out the orders of rank 0 until there is no more work.
+
+use std::process::ExitCode;
+use std::sync::Arc;
+
+use super::{pool, stop_on_ctrl_c};
+use crate::cluster::{Order, Team, await_order};
+use crate::error::{Error, Result};
+use crate::training;
+
+/// Follows rank 0.
+pub(super) fn run(team: &Arc<dyn Team>) -> ExitCode {
+    match follow(team) {
+        Ok(()) => ExitCode::SUCCESS,
+        // Rank 0 prints for all.
+        Err(Error::Interrupted) => ExitCode::from(130),
+        Err(_) => ExitCode::FAILURE,
+    }
+}
+
+fn follow(team: &Arc<dyn Team>) -> Result<()> {
+    let stop = stop_on_ctrl_c()?;
+    // Rank 0 hears of an error of work that was done together; what else there is to do it decides.
+    let mut ended = Ok(());
+    loop {
+        match await_order(&**team)? {
+            Order::Train { job, threads } => {
+                ended = pool(threads)?.install(|| training::take_part(team, &job, &stop));
+            }
+            Order::End => return ended,
+        }
+    }
+}

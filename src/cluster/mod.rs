@@ -1,0 +1,163 @@
+//! Several processes, on one machine or many, that do the work of one.
+//!
+//! `mpirun -n 4 steersman train …` starts four processes of the same program: the ranks. Rank 0 runs the command as ever: it alone reads
+//! the arguments, writes, prints and saves. The others wait for its [orders](Order) and carry them out: see the worker of the command line.
+//! In a training all ranks go through the same steps, each with its share of every batch, and have the same weights after each.
+//!
+//! With the feature `mpi` the ranks are those of MPI (see the module `mpi`); without it there is but this process.
+
+#[cfg(feature = "mpi")]
+pub mod mpi;
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, OnceLock};
+
+use serde::{Deserialize, Serialize};
+
+use crate::engine::network::Ranks;
+use crate::error::{Error, Result};
+
+/// The processes that work together, and how they talk.
+pub trait Team: Ranks {
+    /// The bytes of all ranks; those of this one are `mine`. All ranks call it at once.
+    fn gather_bytes(&self, mine: &[u8]) -> Vec<Vec<u8>>;
+
+    /// Sends `message` to rank `to`.
+    fn send(&self, to: usize, message: &[u8]);
+
+    /// The next message of any rank with that rank, if one has come.
+    fn try_receive(&self) -> Option<(usize, Vec<u8>)>;
+
+    /// Number of ranks on the machine of this one.
+    fn on_this_machine(&self) -> usize;
+
+    /// Bytes that this rank has sent to others so far.
+    fn sent_bytes(&self) -> u64;
+}
+
+static TEAM: OnceLock<Arc<dyn Team>> = OnceLock::new();
+static CLAIMED: AtomicBool = AtomicBool::new(false);
+
+/// The team for one piece of work of rank 0, until it is dropped.
+#[derive(Debug)]
+pub struct Claim {
+    team: Arc<dyn Team>,
+}
+
+impl Claim {
+    /// The team, if there is one, this process leads it, and it has no other work.
+    pub fn of_leader() -> Option<Claim> {
+        let team = TEAM.get().filter(|team| team.rank() == 0 && team.size() > 1)?;
+        (!CLAIMED.swap(true, Ordering::Acquire)).then(|| Claim { team: team.clone() })
+    }
+
+    /// The team.
+    pub fn team(&self) -> &Arc<dyn Team> {
+        &self.team
+    }
+
+    /// Tells the other ranks what to do.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Fault`] if the order cannot be written.
+    pub fn order(&self, order: &Order) -> Result<()> {
+        let message =
+            serde_json::to_vec(order).map_err(|e| Error::Fault(format!("an order cannot be written: {e}")))?;
+        (1..self.team.size()).for_each(|rank| self.team.send(rank, &message));
+        Ok(())
+    }
+}
+
+impl Drop for Claim {
+    fn drop(&mut self) {
+        CLAIMED.store(false, Ordering::Release);
+    }
+}
+
+/// What rank 0 tells the others to do.
+#[derive(Debug, Serialize, Deserialize)]
+pub enum Order {
+    /// Take part in a training.
+    Train {
+        /// What [`training`](crate::training) needs to know.
+        job: String,
+        /// Number of threads.
+        threads: usize,
+    },
+    /// There is no more work.
+    End,
+}
+
+/// Waits for the next order of rank 0.
+///
+/// # Errors
+///
+/// [`Error::Fault`] if it cannot be read.
+pub fn await_order(team: &dyn Team) -> Result<Order> {
+    let (_, message) = await_message(team);
+    serde_json::from_slice(&message).map_err(|e| Error::Fault(format!("an order of rank 0 cannot be read: {e}")))
+}
+
+/// Waits for the next message, without keeping a core busy.
+fn await_message(team: &dyn Team) -> (usize, Vec<u8>) {
+    loop {
+        match team.try_receive() {
+            Some(message) => return message,
+            None => std::thread::sleep(std::time::Duration::from_millis(1)),
+        }
+    }
+}
+
+/// Tells the other ranks that there is no more work.
+#[cfg(feature = "mpi")]
+fn dismiss(team: &Arc<dyn Team>) {
+    if let Ok(message) = serde_json::to_vec(&Order::End) {
+        (1..team.size()).for_each(|rank| team.send(rank, &message));
+    }
+}
+
+/// How many of the cores of this machine are for this process, if others of its team run there too and no `threads` are asked for.
+pub fn threads(threads: usize) -> usize {
+    match TEAM.get().map(|team| team.on_this_machine()) {
+        Some(ranks) if threads == 0 && ranks > 1 => {
+            // A launcher that binds its processes to cores has shared them out already.
+            let (allowed, cores) = (std::thread::available_parallelism().map_or(1, usize::from), cores());
+            if allowed < cores { allowed } else { (cores / ranks).max(1) }
+        }
+        _ => threads,
+    }
+}
+
+/// Cores of the machine, whether or not this process may use them.
+fn cores() -> usize {
+    let listed = std::fs::read_to_string("/proc/cpuinfo").map_or(0, |text| text.matches("\nprocessor\t").count() + 1);
+    listed.max(std::thread::available_parallelism().map_or(1, usize::from))
+}
+
+/// The result of this rank if all ranks succeeded, else an error. All ranks call it at once.
+///
+/// # Errors
+///
+/// The error of this rank; if it has none, that of the first rank that has one, with its number.
+pub fn agree<T>(team: &dyn Team, mine: Result<T>) -> Result<T> {
+    let text = match &mine {
+        Ok(_) => String::new(),
+        Err(Error::Interrupted) => INTERRUPTED.into(),
+        Err(error) => error.to_string(),
+    };
+    let all = team.gather_bytes(text.as_bytes());
+    let mine = mine?;
+    match all.iter().enumerate().find(|(_, text)| !text.is_empty()) {
+        None => Ok(mine),
+        Some((_, text)) if text == INTERRUPTED.as_bytes() => Err(Error::Interrupted),
+        Some((rank, text)) => Err(of_rank(rank, all.len(), &String::from_utf8_lossy(text))),
+    }
+}
+
+const INTERRUPTED: &str = "\0interrupted";
+
+/// The error `text` of another rank.
+pub(crate) fn of_rank(rank: usize, ranks: usize, text: &str) -> Error {
+    Error::Rank(format!("rank {rank} of {ranks} (counted from 0): {text}"))
+}

@@ -1,0 +1,71 @@
+//! Batches of which this process has but a share, and what the processes tell each other of their pictures.
+
+use super::*;
+
+impl Loader {
+    /// The second half of [`fill`](Loader::fill): `complete` says whether all samples of the batch could be decoded, by this and all other
+    /// processes. If not, each process makes the whole batch, and keeps its share of what is left.
+    ///
+    /// # Errors
+    /// As [`fill`](Loader::fill).
+    pub fn settle(&self, out: &mut Batch, complete: bool, share: ShareOf) -> Result<()> {
+        if !complete && out.share != (0..out.n) {
+            out.share = 0..out.n;
+            self.make_samples(out)?;
+        }
+        self.close_gaps(out);
+        if complete {
+            return Ok(());
+        }
+        out.share = share(out.n, out.pairs.images() > 0);
+        let Range { start, end } = out.share;
+        for (values, len) in
+            [(&mut out.x, self.spec.preprocessing.output_len()), (&mut out.labels, self.targets.outputs())]
+        {
+            values.copy_within(start * len..end * len, 0);
+            values.truncate((end - start) * len);
+        }
+        Ok(())
+    }
+
+    /// Makes the samples of the share of `out`.
+    pub(super) fn make_samples(&self, out: &mut Batch) -> Result<()> {
+        let len = self.spec.preprocessing.output_len();
+        out.x.resize(out.share.len() * len, 0.0);
+        let outputs = self.targets.outputs();
+        out.labels.resize(out.share.len() * outputs, 0.0);
+        let labels = out.labels.par_chunks_exact_mut(outputs);
+        let samples = out.x.par_chunks_exact_mut(len).zip(labels).zip(&mut out.work[out.share.clone()]);
+        samples.try_for_each(|((x, labels), wanted)| -> Result<()> {
+            wanted.decoded = self.with_scratch(|scratch| self.make_sample(wanted, x, labels, scratch))??;
+            Ok(())
+        })
+    }
+
+    /// What the audit of near twins knows of the pictures that were decoded so far, for [`take_thumbnails`](Loader::take_thumbnails).
+    pub fn thumbnails(&self) -> Vec<u8> {
+        let known =
+            self.thumbnails.iter().enumerate().filter_map(|(picture, thumbnail)| Some((picture, thumbnail.get()?)));
+        let mut bytes = Vec::new();
+        for (picture, thumbnail) in known {
+            bytes.extend((picture as u32).to_le_bytes());
+            bytes.push(u8::from(thumbnail.is_some()));
+            bytes.extend(thumbnail.iter().flat_map(|thumbnail| thumbnail.cells()));
+        }
+        bytes
+    }
+
+    /// Takes over what another process knows of the same pictures.
+    pub fn take_thumbnails(&self, mut bytes: &[u8]) {
+        while let Some((head, rest)) = bytes.split_at_checked(5) {
+            let picture = u32::from_le_bytes([head[0], head[1], head[2], head[3]]) as usize;
+            let len = if head[4] == 0 { 0 } else { Thumbnail::LEN };
+            let Some((cells, rest)) = rest.split_at_checked(len) else { return };
+            bytes = rest;
+            let thumbnail = Thumbnail::of_cells(cells);
+            if let Some(known) = self.thumbnails.get(picture) {
+                known.get_or_init(|| thumbnail);
+            }
+        }
+    }
+}
