@@ -16,6 +16,7 @@ const MAX_DISTANCE_M: f32 = 330.0;
 const FRACTION_BITS: u32 = 14;
 
 /// Draws walls and sprites over the ground of `frame`.
+#[inline(never)]
 pub(crate) fn draw(depths: &mut [f32], view: &View, frame: &mut RgbFrame) {
     for piece in &view.world.walls {
         draw_wall(depths, view, piece, frame);
@@ -41,7 +42,7 @@ fn draw_sprite(depths: &mut [f32], view: &View, sprite: &Sprite, frame: &mut Rgb
     if top >= bottom || high < 0.7 {
         return;
     }
-    let level = picture.level(high);
+    let level = picture.level(high, wide);
     let (w, h) = (level.width, level.height);
     let light = (sprite.light * 256.0).min(256.0) as u32;
     let (inverse, air) = (1.0 / foot.z, view.air(foot.z));

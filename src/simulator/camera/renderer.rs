@@ -85,6 +85,7 @@ impl Renderer {
 
     /// Finds the depth at every row of the marched columns. Rows are the outer loop: the searches of a row do not depend
     /// on each other, so the processor works on several at once.
+    #[inline(never)]
     fn march(&mut self, view: &View, mount: Option<Mount>) {
         let mut lasts = [Some(NEAREST); ANCHORS];
         for (row, anchors) in self.anchors.chunks_exact_mut(ANCHORS).enumerate().rev() {
@@ -107,6 +108,7 @@ impl Renderer {
         }
     }
 
+    #[inline(never)]
     fn shade(&mut self, view: &View, mount: Option<Mount>, frame: &mut RgbFrame) {
         let mut spots = [Spot::default(); ANCHORS];
         for row in (0..HEIGHT).rev() {
@@ -141,7 +143,7 @@ impl Renderer {
                         levels = view.levels(a, (below[k] - a.inverse).abs());
                         known = *a;
                     }
-                    view.shade_span(a, b, lap, &levels, out, depth);
+                    view.shade_span(row, a, b, lap, &levels, out, depth);
                 } else {
                     view.shade_each(row, k, &depths_below[k], out, depth);
                 }

@@ -5,7 +5,7 @@ use crate::simulator::math::Vec3;
 use crate::simulator::scenery::light::Variant;
 use crate::simulator::scenery::road_texture::{ACROSS_UNITS, ACROSS_UNITS_PER_M, ALONG_UNITS_PER_M, HALF_M, Level};
 use crate::simulator::scenery::sky::{AROUND, SkyPlace};
-use crate::simulator::scenery::terrain::{GROUND_UNITS_PER_M, GroundLevel, NO_STATION};
+use crate::simulator::scenery::terrain::{GROUND_FRACTION_BITS, GROUND_UNITS_PER_M, GroundLevel, NO_STATION};
 use crate::simulator::scenery::texel::{clip, fixed};
 use crate::simulator::scenery::world::World;
 
@@ -25,6 +25,20 @@ const TURN_PX: f32 = 900.0;
 const RED_BLUE: u32 = 0x00ff_00ff;
 /// Full light.
 pub(super) const FULL: u32 = 256;
+/// Offsets on the land's map, up to half a texel of its finest level, for the pixels of a span in each of four rows: the places of an
+/// ordered dither, along x and, mirrored, along y.
+const SCATTER: [[(i32, i32); SPAN]; 4] = {
+    const ORDER: [[i32; 4]; 4] = [[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]];
+    const STEP: i32 = (1 << GROUND_FRACTION_BITS) / 16;
+    let mut offsets = [[(0, 0); SPAN]; 4];
+    let mut at = 0;
+    while at < 4 * SPAN {
+        let (row, i) = (at / SPAN, at % SPAN);
+        offsets[row][i] = ((ORDER[row][i % 4] * 2 - 15) * STEP / 2, (ORDER[i % 4][3 - row] * 2 - 15) * STEP / 2);
+        at += 1;
+    }
+    offsets
+};
 /// Everything that finds and shades the ground of one frame.
 pub(super) struct View<'a> {
     pub(super) world: &'a World,
@@ -226,8 +240,10 @@ impl View<'_> {
     }
 
     /// Shades eight pixels between two marched columns.
+    #[inline(always)]
     pub(super) fn shade_span(
         &self,
+        row: usize,
         a: &Spot,
         b: &Spot,
         lap: i32,
@@ -246,6 +262,15 @@ impl View<'_> {
         let texture = &self.world.textures[a.look as usize];
         if !near_road || texture.is_beyond(a.across, b.across) {
             let (ground, air) = (levels.ground, levels.air);
+            if ground.is_finest() {
+                // Near land has texels larger than pixels; scattered places dissolve their corners.
+                for (out, (sx, sy)) in out.iter_mut().zip(SCATTER[row % SCATTER.len()]) {
+                    self.finish(ground.fetch((place.x + sx).max(0), (place.y + sy).max(0)), FULL, &air, out);
+                    place.x += dx;
+                    place.y += dy;
+                }
+                return;
+            }
             for out in out {
                 self.finish(ground.fetch(place.x, place.y), FULL, &air, out);
                 place.x += dx;

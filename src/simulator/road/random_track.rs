@@ -134,7 +134,9 @@ const LOOKS: [&str; 3] = ["first", "second", "third"];
 fn looks(seed: u64, rng: &mut Rng) -> TrackSpec {
     let look = LOOKS.map(|name| look(rng, name)).to_vec();
     let ground = [soil(rng), soil(rng)];
-    let all = [Plant::Pine, Plant::Broadleaf, Plant::Palm, Plant::Bush, Plant::Boulder];
+    let all = [Plant::Pine, Plant::Broadleaf, Plant::Palm, Plant::Bush, Plant::Boulder, Plant::Pine, Plant::Reeds];
+    // What was added later has numbers of its own, so that the roads of all seeds stay what they are.
+    let mut more = Rng::new(seed, "looks");
     let sky = pick(
         rng,
         &[
@@ -164,11 +166,15 @@ fn looks(seed: u64, rng: &mut Rng) -> TrackSpec {
             plants_per_100_m: rng.between(2.0, 40.0) as f32,
             plants_from_m: rng.between(2.0, 5.0) as f32,
             posts: pick(rng, &[None, Some(Plant::Post), Some(Plant::Board)]),
+            mounds_m: (more.unit() * 14.0 - 5.0).clamp(0.0, 9.0) as f32,
+            sandy: (more.unit() * 0.7 - 0.25).clamp(0.0, 0.45) as f32,
+            woods: (more.unit() * 1.6 - 0.5).clamp(0.0, 1.0) as f32,
+            pylons: more.unit() < 0.4,
         },
         light: Light {
             sun_azimuth_deg: rng.between(0.0, 360.0),
             sun_elevation_deg: rng.between(20.0, 68.0),
-            shade: rng.between(0.25, 0.7) as f32,
+            shade: rng.between(0.34, 0.72) as f32,
             sun: near(rng, [242, 236, 220], 14.0),
             zenith: near(rng, sky.0, 12.0),
             horizon: near(rng, sky.1, 12.0),

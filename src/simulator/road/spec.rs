@@ -51,6 +51,9 @@ impl TrackSpec {
             ("land: hills_m", f64::from(land.hills_m), 0.0, 200.0),
             ("land: plants_per_100_m", land.plants_per_100_m.into(), 0.0, 100.0),
             ("land: plants_from_m", land.plants_from_m.into(), 0.5, 60.0),
+            ("land: mounds_m", land.mounds_m.into(), 0.0, 20.0),
+            ("land: sandy", land.sandy.into(), 0.0, 1.0),
+            ("land: woods", land.woods.into(), 0.0, 1.0),
             ("light: sun_azimuth_deg", light.sun_azimuth_deg, -360.0, 360.0),
             ("light: sun_elevation_deg", light.sun_elevation_deg, 5.0, 85.0),
             ("light: shade", light.shade.into(), 0.1, 1.0),
@@ -199,11 +202,11 @@ pub enum Edge {
     Bare,
     /// A solid white line.
     White,
-    /// A solid yellow line, with a light kerb stone beyond.
+    /// A solid yellow line, then a strip of asphalt and a wide pale apron of concrete that rises outwards.
     YellowKerbstone,
     /// A solid yellow line.
     Yellow,
-    /// Red and white kerb blocks.
+    /// A solid yellow line, then red and white kerb blocks with a strip of pale concrete beyond.
     Kerb,
     /// White dashes, 1 m in every 3 m; only on held-out tracks.
     Dashes,
@@ -302,6 +305,18 @@ pub struct Land {
     /// Posts beside sharp bends.
     #[serde(default)]
     pub posts: Option<Plant>,
+    /// Height of mounds near the road, m; the highest are domes of rock.
+    #[serde(default)]
+    pub mounds_m: f32,
+    /// Share of the ground that is bare, in the colour of the shore, 0 to 1.
+    #[serde(default)]
+    pub sandy: f32,
+    /// How dense woods stand on the slopes and along the horizon, 0 (none) to 1.
+    #[serde(default)]
+    pub woods: f32,
+    /// Pylons of a power line across the land.
+    #[serde(default)]
+    pub pylons: bool,
 }
 
 /// Things that stand beside the road, drawn as upright pictures.
@@ -322,8 +337,12 @@ pub enum Plant {
     Fir,
     /// A white trunk and light leaves; only on held-out tracks.
     Birch,
+    /// A clump of reeds.
+    Reeds,
     /// A boulder.
     Boulder,
+    /// A steel pylon of a power line.
+    Pylon,
     /// A red and white board on a white post.
     Board,
     /// A short white post.

@@ -1,6 +1,6 @@
 //! Procedural pictures of the objects beside the road, with mipmaps for distant ones.
 
-use crate::simulator::math::{hash2, value_noise};
+use crate::simulator::math::{hash2, lerp, smoothstep, value_noise};
 use crate::simulator::road::spec::Plant;
 use crate::simulator::scenery::texel::pack;
 
@@ -43,8 +43,9 @@ impl PictureLevel {
 }
 
 impl Picture {
-    /// The level for an object that is `pixels` high in the frame.
-    pub fn level(&self, pixels: f32) -> &PictureLevel {
+    /// The level for an object that is `high` by `wide` pixels in the frame.
+    pub fn level(&self, high: f32, wide: f32) -> &PictureLevel {
+        let pixels = high.max(wide * (H / W) as f32);
         let mut k = 0;
         while k + 1 < self.levels.len() && (H >> k) as f32 > pixels * 1.5 {
             k += 1;
@@ -55,14 +56,16 @@ impl Picture {
     /// Paints a plant; `variant` changes details.
     pub fn paint(plant: Plant, variant: u32) -> Picture {
         let (width_m, height_m) = match plant {
-            Plant::Pine => (4.6, 11.0),
+            Plant::Pine => (5.0, 12.0),
             Plant::Broadleaf => (6.0, 7.5),
             Plant::Palm => (5.5, 6.5),
             Plant::Bush => (2.6, 1.3),
             Plant::Cypress => (1.8, 8.5),
             Plant::Fir => (5.0, 12.5),
             Plant::Birch => (4.4, 11.0),
+            Plant::Reeds => (4.2, 2.3),
             Plant::Boulder => (3.4, 2.0),
+            Plant::Pylon => (9.0, 30.0),
             Plant::Board => (0.9, 2.6),
             Plant::Post => (0.16, 0.95),
         };
@@ -116,9 +119,11 @@ fn texel(plant: Plant, x: f32, y: f32, u: i32, v: i32, seed: u32) -> u32 {
                 lobe((h - 0.5) * 0.6, 0.5 + 0.08 * k as f32, 0.55 - 0.055 * k as f32, 0.075)
             });
             if tufts {
-                solid([92.0, 104.0, 50.0], shade)
-            } else if trunk(0.06, 0.85) {
-                solid([88.0, 66.0, 48.0], 0.8 + 0.4 * leaf)
+                // Needles are olive in the sun and nearly black beneath.
+                let lit = smoothstep(0.35, 0.95, leaf + 0.25 * (0.2 - x));
+                solid(std::array::from_fn(|k| lerp([34.0, 42.0, 26.0][k], [148.0, 142.0, 66.0][k], lit)), 1.0)
+            } else if trunk(0.05, 0.85) {
+                solid([74.0, 60.0, 46.0], 0.7 + 0.5 * leaf)
             } else {
                 0
             }
@@ -155,7 +160,7 @@ fn texel(plant: Plant, x: f32, y: f32, u: i32, v: i32, seed: u32) -> u32 {
             let clump =
                 [(-0.5, 0.2, 0.36, 0.3), (-0.14, 0.36, 0.4, 0.4), (0.26, 0.28, 0.4, 0.36), (0.56, 0.14, 0.32, 0.26)];
             if clump.iter().any(|(cx, cy, rx, ry)| lobe(*cx, *cy, *rx, *ry)) {
-                solid([86.0, 96.0, 46.0], shade * 0.85)
+                solid([66.0, 74.0, 32.0], shade * 0.8)
             } else {
                 0
             }
@@ -185,6 +190,30 @@ fn texel(plant: Plant, x: f32, y: f32, u: i32, v: i32, seed: u32) -> u32 {
             } else {
                 0
             }
+        }
+        Plant::Reeds => {
+            // Blades that lean a little, lighter at their tips.
+            let blade = (x * 17.0 + 3.0 * y * x).floor();
+            let h = hash2(blade as i32, 3, seed);
+            let tall = (0.45 + 0.55 * h) * (1.0 - 0.55 * x * x);
+            let thin = ((x * 17.0 + 3.0 * y * x) - blade - 0.5).abs() < 0.5 * (1.0 - 0.7 * y / tall);
+            if y < tall && (thin || y < 0.35 * tall) {
+                solid([78.0, 84.0, 34.0], 0.38 + 0.62 * y / tall + 0.3 * (h - 0.5))
+            } else {
+                0
+            }
+        }
+        Plant::Pylon => {
+            // Four legs that meet, braces between them, and three arms.
+            let half = 0.3 * (1.0 - y) + 0.05;
+            let leg = (x.abs() - half).abs() < 0.045 && y < 0.97;
+            let bay = (y * 11.0).fract();
+            let brace = y < 0.9 && x.abs() < half && ((x / half).abs() - (2.0 * bay - 1.0).abs()).abs() < 0.16;
+            let arm = [0.66, 0.78, 0.9].iter().any(|a| {
+                let reach = 0.95 - 1.4 * (a - 0.66);
+                x.abs() < reach && (y - a - 0.012 * (1.0 - x.abs() / reach)).abs() < 0.011
+            });
+            if leg || brace || arm { solid([58.0, 72.0, 92.0], side) } else { 0 }
         }
         Plant::Boulder => {
             if lobe(0.0, 0.22, 0.76, 0.55) {

@@ -66,12 +66,15 @@ impl Level<'_> {
 
 impl RoadTexture {
     /// Paints a look, seen in light of colour `sun` (1 = white), and all its averages.
-    pub fn paint(look: &Look, sun: [f32; 3], seed: u32) -> RoadTexture {
+    ///
+    /// `sun_from_right` is the share of the sun's horizontal direction that comes from the right of the road, -1 to 1: it lights the
+    /// aprons, which face the road.
+    pub fn paint(look: &Look, sun: [f32; 3], sun_from_right: f32, seed: u32) -> RoadTexture {
         use rayon::prelude::*;
         let texel = |at: usize| {
             let along = ((at / SIZE) as f32 + 0.5) * PERIOD_M / SIZE as f32;
             let across = ((at % SIZE) as f32 + 0.5) * 2.0 * HALF_M / SIZE as f32 - HALF_M;
-            paint_texel(look, along, across, sun, seed)
+            paint_texel(look, along, across, (sun, sun_from_right), seed)
         };
         let mut level: Vec<u32> = (0..SIZE * SIZE).into_par_iter().map(texel).collect();
         let (paved, covered) = extent(&level);
@@ -179,18 +182,43 @@ fn grain(along: f32, across: f32, size_m: f32, stretch: f32, seed: u32) -> f32 {
 /// Maximum distance of a ragged border from the edge, m.
 const MAX_RAGGED_M: f32 = 0.8;
 
-fn paint_texel(look: &Look, along: f32, across: f32, sun: [f32; 3], seed: u32) -> u32 {
+/// Concrete of an apron that faces the road: in the sun, in light from along the road, and in its own shade.
+const APRON: [[f32; 3]; 3] = [[255.0, 255.0, 240.0], [228.0, 222.0, 204.0], [146.0, 152.0, 158.0]];
+
+/// Colour of a face that looks towards the road; `towards_sun` from -1 to 1.
+fn apron(towards_sun: f32) -> [f32; 3] {
+    let [lit, level, shaded] = APRON;
+    if towards_sun > 0.0 { mix(level, lit, towards_sun) } else { mix(level, shaded, -towards_sun) }
+}
+
+/// Whether the edge has a face whose light depends on where the sun is.
+pub fn is_raised(edge: Edge) -> bool {
+    matches!(edge, Edge::Kerb | Edge::YellowKerbstone)
+}
+
+/// Width of the blocks of a kerb, and of the strip of asphalt beside a yellow line, m.
+const BLOCKS_M: f32 = 1.35;
+const STRIP_M: f32 = 0.35;
+
+/// Width and colour of what lies beyond an edge at `out` m from it, before the shoulder.
+fn beyond_edge(look: &Look, edge: Edge, along: f32, out: f32, towards_sun: f32) -> (f32, [f32; 3]) {
+    let shade = 0.86 + 0.2 * towards_sun;
+    match edge {
+        Edge::Kerb => {
+            let block = if along.rem_euclid(1.2) < 0.6 { [242.0, 112.0, 98.0] } else { [255.0, 248.0, 236.0] };
+            (2.2, if out < BLOCKS_M { block.map(|c| c * shade) } else { apron(towards_sun) })
+        }
+        Edge::YellowKerbstone => (2.5, if out < STRIP_M { scaled(look.tone, 0.74) } else { apron(towards_sun) }),
+        _ => (0.0, [0.0; 3]),
+    }
+}
+
+fn paint_texel(look: &Look, along: f32, across: f32, (sun, sun_from_right): ([f32; 3], f32), seed: u32) -> u32 {
     let edge = if across < 0.0 { look.left } else { look.right };
     let out = across.abs() - HALF_ROAD_M;
     // Noise is the most expensive part, so it is computed only where it shows.
-    let (kerb_m, kerb) = match edge {
-        Edge::Kerb => {
-            let red = along.rem_euclid(1.5) < 0.75;
-            (0.95, if red { [214.0, 88.0, 80.0] } else { [236.0, 228.0, 220.0] })
-        }
-        Edge::YellowKerbstone => (0.75, [206.0, 200.0, 186.0]),
-        _ => (0.0, [0.0; 3]),
-    };
+    let towards_sun = if across < 0.0 { sun_from_right } else { -sun_from_right };
+    let (kerb_m, kerb) = beyond_edge(look, edge, along, out, towards_sun);
     let ragged = match edge {
         _ if (out - kerb_m).abs() > MAX_RAGGED_M => 0.0,
         Edge::Overgrown => {
@@ -201,7 +229,7 @@ fn paint_texel(look: &Look, along: f32, across: f32, sun: [f32; 3], seed: u32) -
     };
     // Beyond the edge: kerbs first, then the shoulder, then the land shows through.
     let rgb = if out > 0.0 && out < kerb_m {
-        mix(kerb, [90.0; 3], 0.25 * (0.5 + grain(along, across, 0.3, 1.0, seed + 3)))
+        mix(kerb, [90.0; 3], 0.14 * (0.5 + grain(along, across, 0.3, 1.0, seed + 3)))
     } else if out + ragged > kerb_m {
         let n = 1.0 + 0.5 * grain(along, across, 0.15, 1.0, seed + 1) + 0.35 * grain(along, across, 1.1, 1.0, seed + 2);
         scaled(look.shoulder, n)
@@ -228,7 +256,7 @@ fn painted_surface(look: &Look, edge: Edge, along: f32, across: f32, seed: u32) 
     };
     let paint = match edge {
         Edge::White if line(0.24, 0.1) => Some(WHITE),
-        Edge::Yellow | Edge::YellowKerbstone if line(0.42, 0.07) => Some(YELLOW),
+        Edge::Yellow | Edge::YellowKerbstone | Edge::Kerb if line(0.3, 0.07) => Some(YELLOW),
         Edge::Dashes if line(0.3, 0.08) && along.rem_euclid(3.0) < 1.0 => Some(WHITE),
         _ => centre,
     };
@@ -240,7 +268,9 @@ fn surface(look: &Look, along: f32, across: f32, seed: u32) -> [f32; 3] {
     let fine = grain(along, across, 0.07, 1.0, seed);
     let medium = grain(along, across, 0.35, 2.0, seed + 11);
     let large = grain(along, across, 2.0, 3.0, seed + 12);
-    let plain = 1.0 + look.grain * (1.1 * fine + 0.5 * medium) + 0.15 * large;
+    // Light stones between dark ones.
+    let stones = 1.1 * fine + 0.9 * (fine - 0.2).max(0.0);
+    let plain = 1.0 + look.grain * (stones + 0.2 * medium) + 0.18 * large;
     match look.surface {
         Surface::Asphalt => scaled(look.tone, plain),
         Surface::Patched => {
@@ -310,7 +340,7 @@ mod tests {
 
     #[test]
     fn averages_keep_the_mean_colour_and_lines_survive_along_the_road() {
-        let texture = RoadTexture::paint(&look(), [1.0; 3], 1);
+        let texture = RoadTexture::paint(&look(), [1.0; 3], 0.0, 1);
         let red = |texel: u32| (texel & 255) as f32;
         let fine = texture.level(0.01, 0.01);
         let mean = |across: f32| {
@@ -327,7 +357,7 @@ mod tests {
 
     #[test]
     fn the_land_shows_beyond_the_shoulder_and_the_pattern_repeats() {
-        let texture = RoadTexture::paint(&look(), [1.0; 3], 1);
+        let texture = RoadTexture::paint(&look(), [1.0; 3], 0.0, 1);
         let fine = texture.level(0.01, 0.01);
         for along in [0.5, 7.0, 20.0] {
             assert_eq!(at(&fine, along, 0.5) >> 24, 255);

@@ -1,7 +1,8 @@
 //! The sky and the hills on the horizon, as one panorama.
 
-use crate::simulator::math::{hash2, lerp, smoothstep, value_noise};
+use crate::simulator::math::{Rng, hash2, lerp, smoothstep, value_noise};
 use crate::simulator::road::line::Road;
+use crate::simulator::road::spec::Land;
 use crate::simulator::scenery::texel::{clip, fixed, pack};
 
 /// Texels around the horizon; a power of two.
@@ -25,6 +26,7 @@ impl Sky {
         let rgb = |c: [u8; 3]| c.map(f32::from);
         let (zenith, horizon) = (rgb(light.zenith), rgb(light.horizon));
         let mut texels = vec![0; AROUND * UP];
+        let mut ridges = Vec::with_capacity(AROUND);
         for i in 0..AROUND {
             // Two ranges of hills; the nearer one is wooded.
             let ridge = |cells: i32, seed: u32| {
@@ -63,8 +65,41 @@ impl Sky {
                 }
                 texels[j * AROUND + i] = pack(c, 1.0);
             }
+            ridges.push([far, near]);
         }
-        Sky { texels }
+        let mut sky = Sky { texels };
+        sky.wood(&ridges, land, horizon);
+        sky
+    }
+
+    /// Stands trees on the two ranges of hills, the farther one first. `ridges` are the tangents of their tops in each direction.
+    fn wood(&mut self, ridges: &[[f32; 2]], land: &Land, horizon: [f32; 3]) {
+        const TREES: f32 = 2600.0;
+        const DARK: [f32; 3] = [44.0, 54.0, 34.0];
+        const LIT: [f32; 3] = [140.0, 140.0, 74.0];
+        let mut rng = Rng::new(u64::from(land.seed), "wooded horizon");
+        for (range, air, size) in [(0, 0.66, 5.0), (1, 0.48, 7.0)] {
+            for _ in 0..(TREES * land.woods) as usize {
+                let i = rng.below(AROUND);
+                // Woods grow in patches, more of them on the slope than along the top.
+                let patch = value_noise(i as f32 * 24.0 / AROUND as f32, 0.5, Some((24, 2)), land.seed + 90 + range);
+                let (down, high, shape) = (rng.unit() as f32, size * rng.between(0.6, 1.3) as f32, rng.unit() as f32);
+                if rng.unit() as f32 > 1.6 * patch - 0.2 {
+                    continue;
+                }
+                let foot = (ridges[i][range as usize] - 0.09 * down * down - MIN_TANGENT) * PER_TANGENT;
+                for v in 0..high as usize {
+                    let up = (v as f32 + 0.5) / high;
+                    let half = if up < 0.25 { 0.3 } else { high * (0.16 + 0.1 * shape) * (1.3 - up) };
+                    for u in -(half as i32)..=half as i32 {
+                        let at = (i as i32 + u).rem_euclid(AROUND as i32) as usize;
+                        let Some(texel) = self.texels.get_mut((foot as usize + v) * AROUND + at) else { continue };
+                        let lit = (0.45 - 0.4 * u as f32 / half.max(1.0) + 0.5 * (up - 0.5)).clamp(0.0, 1.0);
+                        *texel = pack(std::array::from_fn(|k| lerp(lerp(DARK[k], LIT[k], lit), horizon[k], air)), 1.0);
+                    }
+                }
+            }
+        }
     }
 
     /// The texel at a place.

@@ -118,6 +118,7 @@ impl Terrain {
                 let near = plane as f32
                     + p.rise_m * wobble * smoothstep(p.from_m, p.to_m, edge)
                     + bumps * smoothstep(1.2, 9.0, edge)
+                    + p.hills * mounds(land, x as f32, y as f32).0 * smoothstep(3.5, 11.0, edge)
                     + p.hills * hills(land, x as f32, y as f32) * smoothstep(9.0, 60.0, edge);
                 *height = lerp(near, away, smoothstep(40.0, REACH_M as f32 - 4.0, edge + s.width_m as f32 / 2.0));
                 *soft = smoothstep(1.0, 9.0, edge);
@@ -253,6 +254,17 @@ fn hills(land: &Land, x: f32, y: f32) -> f32 {
     land.hills_m * ((a - 0.3).max(0.0) * 1.1 + (b - 0.5) * 0.25)
 }
 
+/// Mounds a few metres across, with level ground between them; the highest are domes of rock. Also how much of the ground is rock.
+fn mounds(land: &Land, x: f32, y: f32) -> (f32, f32) {
+    if land.mounds_m == 0.0 {
+        return (0.0, 0.0);
+    }
+    let a = value_noise(x / 17.0, y / 17.0, None, land.seed + 5);
+    let b = value_noise(x / 5.0, y / 5.0, None, land.seed + 6);
+    let dome = smoothstep(0.68, 0.84, a + 0.08 * (b - 0.5));
+    (land.mounds_m * ((a - 0.4).max(0.0) * (0.8 + 0.4 * b) + 0.42 * dome), smoothstep(0.05, 0.35, dome))
+}
+
 /// Height of the plain far from the road: a mean of the road's heights, weighted by nearness, on a grid of 16 m.
 struct FarLand {
     nx: usize,
@@ -296,6 +308,9 @@ pub struct GroundMap {
     levels: Vec<(Vec<u32>, usize, usize)>,
 }
 
+/// Colour of the light in the shade, which comes from the sky.
+const SKYLIGHT: [f32; 3] = [0.9, 0.98, 1.12];
+
 /// Alpha of a texel in full sun on flat ground.
 pub const FULL_LIGHT: f32 = 128.0;
 
@@ -326,14 +341,24 @@ impl GroundMap {
                 let tufts = value_noise(gx / 1.3, gy / 1.3, None, land.seed + 11);
                 let grain = hash2(i as i32, j as i32, land.seed + 12);
                 let mixing = smoothstep(0.3, 0.7, patches * 0.7 + tufts * 0.3);
-                let mut rgb: [f32; 3] =
-                    std::array::from_fn(|k| lerp(tone(land.ground[0])[k], tone(land.ground[1])[k], mixing));
+                let bare = if land.sandy > 0.0 {
+                    let banks = value_noise(gx / 26.0, gy / 26.0, None, land.seed + 15);
+                    let most = 0.1 + 0.8 * land.sandy;
+                    smoothstep(most + 0.04, most - 0.04, 0.85 * banks + 0.15 * tufts)
+                } else {
+                    0.0
+                };
+                let mut rgb: [f32; 3] = std::array::from_fn(|k| {
+                    lerp(lerp(tone(land.ground[0])[k], tone(land.ground[1])[k], mixing), tone(land.shore)[k], bare)
+                });
                 let steep = smoothstep(0.86, 0.62, up + 0.14 * (tufts - 0.5));
-                let shade = 0.78 + 0.28 * tufts + 0.18 * grain;
+                let (_, dome) = mounds(land, gx + terrain.x0, gy + terrain.y0);
+                let steep = steep.max(dome * smoothstep(0.35, 0.6, tufts * 0.3 + 0.7 * dome));
+                let shade = 0.74 + (0.36 * tufts + 0.18 * grain) * (1.0 - 0.6 * bare) + 0.08 * bare;
                 // Seen from the side of a rock face, what is painted from above runs down in streaks.
                 let streaks = value_noise(gx / 0.9, gy / 0.9, None, land.seed + 14);
                 let layers = value_noise(gx / 2.1, height / 1.4 + gy / 5.0, None, land.seed + 13);
-                let rocky = 0.45 + 0.4 * layers + 0.5 * streaks + 0.2 * grain;
+                let rocky = 0.5 + 0.35 * layers + 0.45 * streaks + 0.15 * grain;
                 let mut glare = 1.0;
                 for (k, c) in rgb.iter_mut().enumerate() {
                     *c = lerp(*c * shade, tone(land.rock)[k] * rocky, steep);
@@ -352,8 +377,11 @@ impl GroundMap {
                     }
                 }
                 let bright = lerp(1.0, brightness, glare);
-                let coloured: [f32; 3] =
-                    std::array::from_fn(|k| rgb[k] * bright * lerp(1.0, f32::from(light.sun[k]) / 255.0, glare));
+                let sunny = ((brightness - light.shade) / (1.0 - light.shade).max(0.05)).clamp(0.0, 1.0);
+                let coloured: [f32; 3] = std::array::from_fn(|k| {
+                    let sun = lerp(SKYLIGHT[k], f32::from(light.sun[k]) / 255.0, sunny);
+                    rgb[k] * bright * lerp(1.0, sun, glare)
+                });
                 *texel = pack(coloured, bright * FULL_LIGHT / 255.0);
             }
         });
@@ -412,6 +440,12 @@ pub struct GroundLevel<'a> {
 }
 
 impl GroundLevel<'_> {
+    /// Whether its texels are as fine as the map has them, and so may be larger than pixels.
+    #[inline(always)]
+    pub fn is_finest(&self) -> bool {
+        self.shift == GROUND_FRACTION_BITS
+    }
+
     /// The texel at a fixed-point place within the grid.
     #[inline(always)]
     pub fn fetch(&self, x: i32, y: i32) -> u32 {

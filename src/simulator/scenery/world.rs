@@ -2,9 +2,9 @@
 
 use crate::simulator::math::{Rng, Vec3, lerp, sin_cos, smoothstep, value_noise, vec3};
 use crate::simulator::road::line::{Road, Station, WALL_GAP_M};
-use crate::simulator::road::spec::{Plant, Wall};
+use crate::simulator::road::spec::{Look, Plant, Wall};
 use crate::simulator::scenery::pictures::Picture;
-use crate::simulator::scenery::road_texture::{HALF_ROAD_M, PERIOD_M, RoadTexture};
+use crate::simulator::scenery::road_texture::{HALF_ROAD_M, PERIOD_M, RoadTexture, is_raised};
 use crate::simulator::scenery::sky::Sky;
 use crate::simulator::scenery::terrain::{GroundMap, NO_STATION, Terrain};
 
@@ -25,7 +25,7 @@ pub struct RoadCell {
     pub along_m: f32,
     /// Metres of texture per metre to the right.
     pub across_scale: f32,
-    /// Index of the look.
+    /// Index of the texture.
     pub look: u32,
 }
 
@@ -67,7 +67,7 @@ pub struct World {
     pub road: Vec<RoadCell>,
     /// Length of a lap in texture metres; a whole number of periods.
     pub road_length_m: f32,
-    /// Surface of each look.
+    /// Surfaces: of each look one, or one for each [`SUN_SIDES`] if it has raised edges.
     pub textures: Vec<RoadTexture>,
     /// Objects beside the road.
     pub sprites: Vec<Sprite>,
@@ -98,21 +98,24 @@ impl World {
         let mut scenery = Scenery::new(road, &terrain, &lit);
         scenery.plant();
         scenery.post();
+        scenery.wood();
+        scenery.lead_power_line();
         let walls = walls(road, &terrain, &lit);
         let shadow = shadows(road, &terrain, &scenery.sprites, &scenery.kinds, sun);
         let ground = GroundMap::build(road, &terrain, &lit, &shadow);
         let periods = (road.length_m / f64::from(PERIOD_M)).round().max(1.0) as f32;
         let road_length_m = periods * PERIOD_M;
+        let surfaces = surfaces(&road.spec.look);
         World {
             ground,
-            road: road_cells(road, &terrain, road_length_m),
+            road: road_cells(road, &terrain, road_length_m, sun, &surfaces),
             road_length_m,
-            textures: road
-                .spec
-                .look
+            textures: surfaces
                 .iter()
-                .zip(1..)
-                .map(|(l, k)| RoadTexture::paint(l, sunlight, land.seed * 31 + 97 * k))
+                .map(|(look, side)| {
+                    let seed = land.seed * 31 + 97 * (*look as u32 + 1);
+                    RoadTexture::paint(&road.spec.look[*look], sunlight, *side, seed)
+                })
                 .collect(),
             sprites: scenery.sprites,
             pictures: scenery.pictures,
@@ -125,11 +128,35 @@ impl World {
     }
 }
 
-fn road_cells(road: &Road, terrain: &Terrain, road_length_m: f32) -> Vec<RoadCell> {
+/// Shares of the sun's direction from the right for which a look with raised edges is painted.
+const SUN_SIDES: [f32; 3] = [-0.8, 0.0, 0.8];
+
+/// Index of the look and share of sun from the right of each texture.
+fn surfaces(looks: &[Look]) -> Vec<(usize, f32)> {
+    let of_look = |(k, look): (usize, &Look)| {
+        let raised = is_raised(look.left) || is_raised(look.right);
+        let sides: &[f32] = if raised { &SUN_SIDES } else { &[0.0] };
+        sides.iter().map(move |side| (k, *side)).collect::<Vec<_>>()
+    };
+    looks.iter().enumerate().flat_map(of_look).collect()
+}
+
+fn road_cells(
+    road: &Road,
+    terrain: &Terrain,
+    road_length_m: f32,
+    sun: Vec3,
+    surfaces: &[(usize, f32)],
+) -> Vec<RoadCell> {
     let n = road.stations.len() as f32;
+    let flat = (sun.x * sun.x + sun.y * sun.y).sqrt().max(1e-3);
     let cell = |(i, s): (usize, &Station)| {
         let name = road.spec.setting_at(road.s_of(i), |s| s.look.clone());
         let look = name.and_then(|n| road.spec.look.iter().position(|l| l.name == n)).unwrap_or(0);
+        let from_right = (sun.x * s.ty as f32 - sun.y * s.tx as f32) / flat;
+        let apart = |k: &usize| (surfaces[*k].1 - from_right).abs();
+        let of_look = (0..surfaces.len()).filter(|k| surfaces[*k].0 == look);
+        let texture = of_look.min_by(|a, b| apart(a).total_cmp(&apart(b))).unwrap_or(0);
         RoadCell {
             gx: s.x as f32 - terrain.x0,
             gy: s.y as f32 - terrain.y0,
@@ -138,7 +165,7 @@ fn road_cells(road: &Road, terrain: &Terrain, road_length_m: f32) -> Vec<RoadCel
             curvature: s.curvature as f32,
             along_m: road_length_m * i as f32 / n,
             across_scale: 2.0 * HALF_ROAD_M / s.width_m as f32,
-            look: look as u32,
+            look: texture as u32,
         }
     };
     road.stations.iter().enumerate().map(cell).collect()
@@ -220,6 +247,60 @@ impl<'a> Scenery<'a> {
         self.sprites.push(Sprite { foot: vec3(x, y, z - 0.1), picture, scale, light, mirrored });
     }
 
+    /// Groves on the land away from the road.
+    fn wood(&mut self) {
+        const GROVES: f32 = 44.0;
+        const TREES: usize = 7;
+        let land = &self.road.spec.land;
+        let tall = land.plants.iter().copied().find(|p| !matches!(p, Plant::Bush | Plant::Boulder | Plant::Reeds));
+        let Some(tree) = tall.filter(|_| land.woods > 0.0) else { return };
+        let mut rng = Rng::new(u64::from(land.seed), "woods");
+        let first = self.pictures_of(tree);
+        for _ in 0..(GROVES * land.woods) as usize {
+            let (x, y) = self.anywhere(&mut rng);
+            for _ in 0..TREES {
+                let (x, y) = (x + rng.normal() as f32 * 6.0, y + rng.normal() as f32 * 6.0);
+                let (variant, scale, mirrored) = (rng.below(VARIANTS), rng.between(0.7, 1.15), rng.unit() < 0.5);
+                if self.is_on_land(x, y) && self.distance_from_edge(x, y).is_none_or(|e| e >= 16.0) {
+                    self.stand(x, y, first + variant, scale as f32, mirrored);
+                }
+            }
+        }
+    }
+
+    /// Pylons in a straight line across the land, those near the road left out.
+    fn lead_power_line(&mut self) {
+        const STEP_M: f64 = 85.0;
+        if !self.road.spec.land.pylons {
+            return;
+        }
+        let mut rng = Rng::new(u64::from(self.road.spec.land.seed), "pylons");
+        let picture = self.pictures_of(Plant::Pylon);
+        let (nx, ny) = (self.terrain.nx as f64, self.terrain.ny as f64);
+        let (sin, cos) = sin_cos(rng.between(0.0, std::f64::consts::PI));
+        let (x, y) = (nx * rng.between(0.3, 0.7), ny * rng.between(0.3, 0.7));
+        for k in -8..=8 {
+            let along = f64::from(k) * STEP_M;
+            let (x, y) = (self.terrain.x0 + (x + cos * along) as f32, self.terrain.y0 + (y + sin * along) as f32);
+            if self.is_on_land(x, y) && self.distance_from_edge(x, y).is_none_or(|e| e >= 12.0) {
+                self.stand(x, y, picture, 1.0, false);
+            }
+        }
+    }
+
+    /// A random place on the grid of the land.
+    fn anywhere(&self, rng: &mut Rng) -> (f32, f32) {
+        let (nx, ny) = (self.terrain.nx as f64, self.terrain.ny as f64);
+        let (x, y) = (rng.between(2.0, nx - 2.0), rng.between(2.0, ny - 2.0));
+        ((f64::from(self.terrain.x0) + x) as f32, (f64::from(self.terrain.y0) + y) as f32)
+    }
+
+    /// Whether the place lies on the grid of the land.
+    fn is_on_land(&self, x: f32, y: f32) -> bool {
+        let (gx, gy) = (x - self.terrain.x0, y - self.terrain.y0);
+        (1.0..self.terrain.nx as f32 - 2.0).contains(&gx) && (1.0..self.terrain.ny as f32 - 2.0).contains(&gy)
+    }
+
     fn plant(&mut self) {
         let land = &self.road.spec.land;
         if land.plants.is_empty() {
@@ -287,7 +368,8 @@ fn shadows(road: &Road, terrain: &Terrain, sprites: &[Sprite], kinds: &[Plant], 
             Plant::Birch => (7.4, 1.7, 2.8, 0.6),
             Plant::Boulder => (0.7, 1.4, 0.8, 0.9),
             Plant::Board => (2.3, 0.5, 0.3, 0.9),
-            Plant::Post => continue,
+            Plant::Reeds => (0.8, 1.8, 0.9, 0.7),
+            Plant::Post | Plant::Pylon => continue,
         };
         let (height, radius, half) = (height * sprite.scale, radius * sprite.scale, half * sprite.scale);
         let (cx, cy) = (sprite.foot.x - sun.x * run * height, sprite.foot.y - sun.y * run * height);
