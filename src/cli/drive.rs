@@ -7,6 +7,7 @@ use serde::Serialize;
 
 use super::drive_donkeysim::{self, DonkeyDriveArgs};
 use super::drive_sweep;
+use super::model_arg::model_file;
 use super::recording_args::RecordingArgs;
 use super::replay::{self, ReplayArgs};
 use super::share_bar::ShareBar;
@@ -14,6 +15,9 @@ use super::throttle::Throttle;
 use super::video::tell_video;
 use super::words::counted;
 use super::{camera_preset, load_pilot, pool, print, print_json, stop_on_ctrl_c};
+#[cfg(feature = "mpi")]
+use crate::cluster::Team;
+use crate::cluster::{Claim, Order, fingerprint};
 use crate::dataset::held_out::trained_on_held_out;
 use crate::error::{Error, Result};
 use crate::files::limits::keep_elsewhere;
@@ -27,6 +31,8 @@ use crate::report::pages::sweep::Swept;
 use crate::report::video::drive::DriveVideo;
 use crate::report::video::onlooker::Onlooker;
 use crate::report::video::painter::Captions;
+#[cfg(feature = "mpi")]
+use crate::simulator::help_drive;
 use crate::simulator::trial::statistics::PairedTest;
 use crate::simulator::trial::trajectory::write_trajectories;
 use crate::simulator::{
@@ -123,7 +129,6 @@ pub fn run(args: DriveArgs) -> Result<()> {
     if args.donkeysim.is_given() {
         return drive_donkeysim::run(&args);
     }
-    let (latency_ms, noise) = (first(&args.latency_ms), first(&args.noise));
     let swept = match (args.latency_ms.len() > 1, args.noise.len() > 1) {
         (false, false) => None,
         (true, false) => Some((Swept::LatencyMs, &args.latency_ms)),
@@ -169,14 +174,7 @@ pub fn run(args: DriveArgs) -> Result<()> {
             "--camera on a track goes neither with --watch nor with --video: leave it out".into(),
         ));
     }
-    let options = DriveOptions {
-        laps: args.laps,
-        runs: args.runs.unwrap_or(RUNS),
-        seed: args.seed,
-        speed: args.throttle.aimed_at(args.speed)?,
-        latency_ms,
-        noise,
-    };
+    let options = args.options()?;
     if let Some((swept, values)) = swept {
         return drive_sweep::run(&args, &track, &options, swept, values);
     }
@@ -193,10 +191,22 @@ pub fn run(args: DriveArgs) -> Result<()> {
         eprintln!("open {} to watch", live.url());
     }
     let pool = pool(args.threads)?;
-    let go = |wheel: &Wheel, name: &str| pool.install(|| wheel.drive(&track, &options, name, live.as_ref(), &stop));
-    let (result, mut stopped) = go(&at_wheel, &args.model)?;
+    // A page shows one run after the other.
+    let claim = if live.is_none() { Claim::of_leader() } else { None };
+    let go = |wheel: &Wheel, name: &str, against: bool| {
+        if let Some(claim) = &claim {
+            claim.order(&Order::Drive {
+                arguments: std::env::args().collect(),
+                against,
+                fingerprint: args.fingerprint(name),
+                threads: pool.current_num_threads(),
+            })?;
+        }
+        pool.install(|| wheel.drive(&track, &options, name, live.as_ref(), &stop, claim.as_ref()))
+    };
+    let (result, mut stopped) = go(&at_wheel, &args.model, false)?;
     let other = match (&against, &args.against) {
-        (Some(wheel), Some(name)) if !stopped => match go(wheel, name) {
+        (Some(wheel), Some(name)) if !stopped => match go(wheel, name, true) {
             Ok((other, false)) => Some(other),
             Ok((_, true)) | Err(Error::Interrupted) => {
                 stopped = true;
@@ -263,7 +273,40 @@ pub(super) fn stop_or_ok(stopped: bool) -> Result<()> {
     if stopped { Err(Error::Interrupted) } else { Ok(()) }
 }
 
+/// Another rank than 0: drives seeds of the drive with these arguments, of `--against` or of the first model.
+#[cfg(feature = "mpi")]
+pub(super) fn help(team: &dyn Team, args: &DriveArgs, against: bool, fingerprint: &str) -> Result<()> {
+    let name = if against { args.against.as_deref().unwrap_or_default() } else { &args.model };
+    let prepare = || {
+        if args.fingerprint(name) != fingerprint {
+            let message =
+                "here is another file than rank 0 has; every rank must find the same model and track at this place";
+            return Err(Error::Data { place: name.into(), message: message.into() });
+        }
+        let (track, wheel) = (Track::load(args.track.as_deref().unwrap_or_default())?, args.wheel(name)?);
+        Ok((track, args.options()?, move || Ok(wheel.driver())))
+    };
+    help_drive(team, prepare())
+}
+
 impl DriveArgs {
+    fn options(&self) -> Result<DriveOptions> {
+        Ok(DriveOptions {
+            laps: self.laps,
+            runs: self.runs.unwrap_or(RUNS),
+            seed: self.seed,
+            speed: self.throttle.aimed_at(self.speed)?,
+            latency_ms: first(&self.latency_ms),
+            noise: first(&self.noise),
+        })
+    }
+
+    /// Of the model `name` and the track, as far as they are files.
+    fn fingerprint(&self, name: &str) -> String {
+        let model = model_file(Path::new(name)).unwrap_or_default();
+        fingerprint(&[model, self.track.as_ref().map(PathBuf::from).unwrap_or_default()])
+    }
+
     /// Who is called `name`, and gives what `--throttle` asks for.
     pub(super) fn wheel(&self, name: &str) -> Result<Wheel> {
         let wheel = Wheel::find(name)?;
@@ -366,6 +409,7 @@ impl Wheel {
         name: &str,
         live: Option<&Live>,
         stop: &StopSignal,
+        claim: Option<&Claim>,
     ) -> Result<(DriveResult, bool)> {
         let new_driver = || Ok(self.driver());
         let (mut result, stopped) = if let Some(live) = live {
@@ -373,7 +417,7 @@ impl Wheel {
             drive_observed_as_far(track, new_driver, options, &mut Watch::new(live, name, pilot, options.runs, stop))?
         } else {
             let mut bar = ShareBar::new(format!("{name} on {}", track.name()), stop);
-            drive_as_far(track, new_driver, options, &mut bar)?
+            drive_as_far(track, new_driver, options, &mut bar, claim)?
         };
         if let Wheel::Model(pilot) | Wheel::InCar(pilot, _) = self {
             result.summary.trained_on_held_out = pilot.trained_on_held_out().to_vec();

@@ -49,7 +49,7 @@ pub fn run(args: &DriveArgs, track: &Track, options: &DriveOptions, swept: Swept
         for (value, options) in &drives {
             let value = *value;
             let name = format!("{driver}, {}", swept.value(value));
-            let result = match pool.install(|| wheel.drive(track, options, &name, None, &stop)) {
+            let result = match pool.install(|| wheel.drive(track, options, &name, None, &stop, None)) {
                 Ok((result, false)) => result,
                 // What is whole is kept.
                 Ok((_, true)) | Err(Error::Interrupted) => {

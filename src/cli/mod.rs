@@ -279,7 +279,7 @@ fn load_pilot(given: &Path) -> Result<Pilot> {
 }
 
 fn say_if_without_digest(path: &Path) -> Result<()> {
-    if let Some(notice) = notice_without_digest(path)? {
+    if let Some(notice) = notice_without_digest(path)?.filter(|_| !crate::cluster::follows()) {
         eprintln!("note: {}", escaped(&notice));
     }
     Ok(())

@@ -3,7 +3,9 @@
 use std::process::ExitCode;
 use std::sync::Arc;
 
-use super::{pool, stop_on_ctrl_c};
+use clap::Parser;
+
+use super::{Cli, Command, drive, pool, stop_on_ctrl_c};
 use crate::cluster::{Order, Team, await_order};
 use crate::error::{Error, Result};
 use crate::training;
@@ -26,6 +28,12 @@ fn follow(team: &Arc<dyn Team>) -> Result<()> {
         match await_order(&**team)? {
             Order::Train { job, threads } => {
                 ended = pool(threads)?.install(|| training::take_part(team, &job, &stop));
+            }
+            Order::Drive { arguments, against, fingerprint, threads } => {
+                // Rank 0 runs with these arguments, so they can be read.
+                if let Ok(Cli { command: Command::Drive(args) }) = Cli::try_parse_from(arguments) {
+                    ended = pool(threads)?.install(|| drive::help(&**team, &args, against, &fingerprint));
+                }
             }
             Order::End => return ended,
         }

@@ -8,11 +8,14 @@
 
 #[cfg(feature = "mpi")]
 pub mod mpi;
+pub mod tasks;
 
+use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, OnceLock};
 
 use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
 
 use crate::engine::network::Ranks;
 use crate::error::{Error, Result};
@@ -85,8 +88,35 @@ pub enum Order {
         /// Number of threads.
         threads: usize,
     },
+    /// Drive seeds of a drive.
+    Drive {
+        /// The command line of rank 0.
+        arguments: Vec<String>,
+        /// Whether the driver is that of `--against`.
+        against: bool,
+        /// What [`fingerprint`] says of the files on rank 0.
+        fingerprint: String,
+        /// Number of threads.
+        threads: usize,
+    },
     /// There is no more work.
     End,
+}
+
+/// Digest of `files`, in hexadecimal digits, by which ranks see whether they have the same ones. A file that is not there counts as empty.
+pub fn fingerprint(files: &[PathBuf]) -> String {
+    let mut hash = Sha256::new();
+    for file in files {
+        let bytes = std::fs::read(file).unwrap_or_default();
+        hash.update((bytes.len() as u64).to_le_bytes());
+        hash.update(bytes);
+    }
+    hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+/// Whether this process does what rank 0 tells it, and prints nothing.
+pub fn follows() -> bool {
+    TEAM.get().is_some_and(|team| team.rank() > 0)
 }
 
 /// Waits for the next order of rank 0.

@@ -13,7 +13,7 @@ pub const INTERVENTION_M: f64 = 1.0;
 pub const INTERVENTION_S: f64 = 6.0;
 
 /// Why a free trial ended early.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Failure {
     /// Hit a wall.
@@ -27,7 +27,7 @@ pub enum Failure {
 }
 
 /// The state of a trial at one frame.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct Moment {
     /// Time since the start, s.
     pub time_s: f64,
@@ -52,7 +52,7 @@ pub struct Moment {
 }
 
 /// The result of one trial of a driver.
-#[derive(Clone, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct Trial {
     /// Moments at 20 Hz.
     pub moments: Vec<Moment>,

@@ -62,7 +62,7 @@ impl DriveOptions {
 }
 
 /// A seed driven twice.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TrialPair {
     /// The seed.
     pub seed: u64,
