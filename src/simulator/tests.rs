@@ -54,6 +54,66 @@ fn random_tracks_exist_for_every_seed_and_high_seeds_are_held_out() {
     assert!(matches!(Track::load("random:x"), Err(Error::Usage(m)) if m.contains("seed")));
 }
 
+/// First 16 digits of the hash of a road's line: places, heights, widths and crossfalls, bit by bit.
+fn hash_of_line(name: &str) -> String {
+    let mut hash = Sha256::new();
+    for s in &Track::load(name).unwrap().stations {
+        [s.x, s.y, s.z, s.width_m, s.crossfall].iter().for_each(|v| hash.update(v.to_le_bytes()));
+    }
+    hash.finalize().iter().take(8).map(|b| format!("{b:02x}")).collect()
+}
+
+/// What a track looks like may change, where its road runs may not: drives on it are compared from version to version.
+#[test]
+fn roads_run_where_they_always_ran() {
+    for (name, hash) in [
+        ("lake", "08ad2e7bae9953d3"),
+        ("mountain", "ebf4b25d0bb430e3"),
+        ("random:1", "92f4a3f28eac7e1e"),
+        ("random:7", "02946c316e46748e"),
+        ("random:1000001", "0008cd8927a617f8"),
+    ] {
+        assert_eq!(hash_of_line(name), hash, "{name}");
+    }
+}
+
+#[test]
+fn nothing_stands_on_a_road_and_the_new_things_are_seen() {
+    let sprites_of = |track: &Track, wide_m: f32| {
+        let of_width = |s: &&scenery::world::Sprite| track.world().pictures[s.picture].width_m == wide_m;
+        track.world().sprites.iter().filter(of_width).count()
+    };
+    for name in ["lake", "mountain", "random:2", "random:3", "random:1000001"] {
+        let track = Track::load(name).unwrap();
+        for sprite in &track.world().sprites {
+            let at = track.locate(f64::from(sprite.foot.x), f64::from(sprite.foot.y));
+            let edge_m = at.offset_m.abs() - track.stations[at.station].width_m / 2.0;
+            assert!(edge_m > 1.0, "{name}: something stands {edge_m} m from the edge");
+        }
+    }
+    let (full, mut bare) = (Track::load("lake").unwrap(), lake_spec());
+    (bare.land.woods, bare.land.pylons) = (0.0, false);
+    let bare = Track::from_spec(bare, "bare").unwrap();
+    let (pine_m, pylon_m) = (5.0, 9.0);
+    assert!(sprites_of(&full, pine_m) > sprites_of(&bare, pine_m) + 50);
+    assert!(sprites_of(&full, pylon_m) > 2 && sprites_of(&bare, pylon_m) == 0);
+}
+
+#[test]
+fn numbers_of_the_land_outside_their_range_are_refused_by_name() {
+    for (entry, set) in [
+        ("mounds_m", (|land, v| land.mounds_m = v) as fn(&mut road::spec::Land, f32)),
+        ("sandy", |land, v| land.sandy = v),
+        ("woods", |land, v| land.woods = v),
+    ] {
+        for value in [-0.1, 21.0, f32::NAN] {
+            let mut spec = lake_spec();
+            set(&mut spec.land, value);
+            assert!(refusal(spec).contains(&format!("land: {entry} is")), "{entry} {value}");
+        }
+    }
+}
+
 #[test]
 fn unknown_tracks_name_the_nearest() {
     let Err(error) = Track::load("moutain") else { panic!("accepted") };

@@ -365,4 +365,21 @@ mod tests {
             assert_eq!(at(&fine, along, 0.5), at(&fine, along + 3.0 * PERIOD_M, 0.5));
         }
     }
+
+    #[test]
+    fn an_apron_is_lighter_where_it_faces_the_sun() {
+        let look = Look { left: Edge::YellowKerbstone, right: Edge::YellowKerbstone, ..look() };
+        // Mean brightness of the left and of the right apron, with the sun on the given side.
+        let aprons = |sun_from_right: f32| {
+            let texture = RoadTexture::paint(&look, [1.0; 3], sun_from_right, 1);
+            let mean = texture.level(PERIOD_M, 0.5);
+            [-5.5, 5.5].map(|across| at(&mean, 3.0, across) & 255)
+        };
+        let ([left, right], [level_left, level_right]) = (aprons(0.8), aprons(0.0));
+        // The left apron looks to the right.
+        assert!(left > level_left + 10 && level_right > right + 30, "{left} {level_left} {level_right} {right}");
+        assert!(level_left.abs_diff(level_right) < 6);
+        let [left, right] = aprons(-0.8);
+        assert!(right > left + 40, "{left} {right}");
+    }
 }
