@@ -4,6 +4,27 @@
 //! the arguments, writes, prints and saves. The others wait for its [orders](Order) and carry them out: see the worker of the command line.
 //! In a training all ranks go through the same steps, each with its share of every batch, and have the same weights after each.
 //!
+//! # What goes over the wire
+//!
+//! In a step, with `P` parameters (of four bytes) on `N` ranks, where `N` is a power of two and the batch has as many shards:
+//!
+//! | what | bytes that a rank sends |
+//! |---|---|
+//! | the sum of the gradient's slices, and the slices of the sum | `2 · 4 P · (N − 1) / N` |
+//! | for each batch-norm barrier, forward and backward: two sums a channel | `16 · channels · (N − 1)` |
+//! | loss, and whether all could go on | `16 · (N − 1)` |
+//!
+//! Another `N` has up to a few subtrees a rank, and the first slices of the gradient go out once for each of them. The notice at the end of a
+//! training says what was counted. Nothing is sent while the backward pass goes on: the gradient is complete only at its end in networks
+//! without batch norm, and its slices are small beside the time of a step.
+//!
+//! # Cores and memory
+//!
+//! The ranks on a machine share out its cores, unless `--threads` says how many each has; a launcher that binds its processes to cores has done
+//! so already. Threads are not bound beyond that. A buffer of a shard lies where the thread that first worked on it touched it, because
+//! buffers are created without being written, so its pages are near that core. Each rank has the buffers of its own shards alone, all
+//! weights, and the decoded pictures that it needed so far, up to `--cache`.
+//!
 //! With the feature `mpi` the ranks are those of MPI (see the module `mpi`); without it there is but this process.
 
 #[cfg(feature = "mpi")]
