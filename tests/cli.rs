@@ -5,7 +5,7 @@ mod common;
 use std::fs;
 use std::path::Path;
 
-use common::command::{error, json, run};
+use common::command::{error, json, run, steersman};
 use common::painted_log;
 
 /// A quick training run: few epochs of the small network.
@@ -292,4 +292,17 @@ fn a_sweep_of_latencies_says_where_a_driver_breaks_and_saves_table_chart_and_dri
         let refused = common::command::error(folder.path(), &[&sweep[..6], arguments].concat());
         assert!(refused.contains(message), "{refused}");
     }
+}
+
+/// Several of them would write into the same folder.
+#[cfg(not(feature = "mpi"))]
+#[test]
+fn a_program_without_mpi_refuses_to_run_several_times_under_its_launcher() {
+    let folder = tempfile::tempdir().unwrap();
+    let started =
+        |ranks: &str| steersman(folder.path()).arg("tracks").env("OMPI_COMM_WORLD_SIZE", ranks).output().unwrap();
+    let output = started("2");
+    assert_eq!(output.status.code(), Some(1));
+    assert!(String::from_utf8_lossy(&output.stderr).contains("--features mpi"));
+    assert!(started("1").status.success());
 }
