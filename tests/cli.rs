@@ -5,7 +5,7 @@ mod common;
 use std::fs;
 use std::path::Path;
 
-use common::command::{error, json, run, steersman};
+use common::command::{error, json, run};
 use common::painted_log;
 
 /// A quick training run: few epochs of the small network.
