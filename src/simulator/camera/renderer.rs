@@ -123,7 +123,7 @@ impl Renderer {
             let (depths, _) = depths.as_chunks_mut::<SPAN>();
             let (depths_below, _) = rest.get(..WIDTH).unwrap_or(&BELOW_PICTURE).as_chunks();
             let mut known = spots[0];
-            let mut levels = view.levels(&known, (below[0] - known.inverse).abs());
+            let mut levels = view.levels(row, &known, (below[0] - known.inverse).abs());
             for (k, (out, depth)) in pixels.as_chunks_mut().0.iter_mut().zip(depths).enumerate() {
                 let (a, b) = (&spots[k], &spots[k + 1]);
                 if hidden.contains(&k) {
@@ -140,10 +140,10 @@ impl Renderer {
                         || a.near_road != known.near_road
                         || (a.depth - known.depth).abs() > 0.08 * a.depth
                     {
-                        levels = view.levels(a, (below[k] - a.inverse).abs());
+                        levels = view.levels(row, a, (below[k] - a.inverse).abs());
                         known = *a;
                     }
-                    view.shade_span(row, a, b, lap, &levels, out, depth);
+                    view.shade_span(a, b, lap, &levels, out, depth);
                 } else {
                     view.shade_each(row, k, &depths_below[k], out, depth);
                 }

@@ -27,7 +27,7 @@ const RED_BLUE: u32 = 0x00ff_00ff;
 pub(super) const FULL: u32 = 256;
 /// Offsets on the land's map, up to half a texel of its finest level, for the pixels of a span in each of four rows: the places of an
 /// ordered dither, along x and, mirrored, along y.
-const SCATTER: [[(i32, i32); SPAN]; 4] = {
+static SCATTER: [[(i32, i32); SPAN]; 4] = {
     const ORDER: [[i32; 4]; 4] = [[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]];
     const STEP: i32 = (1 << GROUND_FRACTION_BITS) / 16;
     let mut offsets = [[(0, 0); SPAN]; 4];
@@ -99,6 +99,8 @@ pub(super) struct Air {
 pub(super) struct Levels<'a> {
     road: Level<'a>,
     ground: GroundLevel<'a>,
+    /// Offsets of the row's pixels on the land's finest map.
+    scatter: &'static [(i32, i32); SPAN],
     air: Air,
 }
 
@@ -218,9 +220,9 @@ impl View<'_> {
         ((way + lap).abs() < along && (b.across - a.across).abs() < across).then_some(lap)
     }
 
-    /// The levels of the road's texture and of the map for the resolution at `a`, and the haze there.
+    /// The levels of the road's texture and of the map for the resolution at `a` on `row`, and the haze there.
     #[inline(always)]
-    pub(super) fn levels(&self, a: &Spot, fall: f32) -> Levels<'_> {
+    pub(super) fn levels(&self, row: usize, a: &Spot, fall: f32) -> Levels<'_> {
         let wide = a.depth * (1.0 / self.camera.focal_px);
         let long = a.depth * a.depth * fall;
         let larger = |p: f32, q: f32| if p > q { p } else { q };
@@ -228,7 +230,7 @@ impl View<'_> {
         let across = larger(a.sin * long, a.cos * wide);
         let road = self.world.textures[a.look as usize].level(along, across);
         let ground = self.world.ground.level(wide * larger(2.0 * wide, long));
-        Levels { road, ground, air: self.air(a.depth) }
+        Levels { road, ground, scatter: &SCATTER[row % SCATTER.len()], air: self.air(a.depth) }
     }
 
     /// The haze in front of an object at `depth`.
@@ -243,7 +245,6 @@ impl View<'_> {
     #[inline(always)]
     pub(super) fn shade_span(
         &self,
-        row: usize,
         a: &Spot,
         b: &Spot,
         lap: i32,
@@ -264,7 +265,8 @@ impl View<'_> {
             let (ground, air) = (levels.ground, levels.air);
             if ground.is_finest() {
                 // Near land has texels larger than pixels; scattered places dissolve their corners.
-                for (out, (sx, sy)) in out.iter_mut().zip(SCATTER[row % SCATTER.len()]) {
+                // They stay on the map: places end 2 texels before its upper rims, and are scattered by less than one.
+                for (out, (sx, sy)) in out.iter_mut().zip(levels.scatter) {
                     self.finish(ground.fetch((place.x + sx).max(0), (place.y + sy).max(0)), FULL, &air, out);
                     place.x += dx;
                     place.y += dy;
@@ -393,7 +395,7 @@ impl View<'_> {
             let spot = self.spot(ray, level, *depth);
             // On level ground inverse depth grows with the fall of the ray.
             let fall = (self.camera.up.z / self.camera.focal_px / (ray.z - 1e-3).abs()).min(1.0) * spot.inverse;
-            let levels = self.levels(&spot, fall);
+            let levels = self.levels(row, &spot, fall);
             let Spot { x, y, along, across, light, .. } = spot;
             let place = Place { x, y, along, across, light: light as i32 * SPAN as i32 };
             self.put(place, spot.near_road, &levels, out);

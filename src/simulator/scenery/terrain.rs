@@ -343,8 +343,8 @@ impl GroundMap {
                 let mixing = smoothstep(0.3, 0.7, patches * 0.7 + tufts * 0.3);
                 let bare = if land.sandy > 0.0 {
                     let banks = value_noise(gx / 26.0, gy / 26.0, None, land.seed + 15);
-                    let most = 0.1 + 0.8 * land.sandy;
-                    smoothstep(most + 0.04, most - 0.04, 0.85 * banks + 0.15 * tufts)
+                    let max_noise = 0.1 + 0.8 * land.sandy;
+                    smoothstep(max_noise + 0.04, max_noise - 0.04, 0.85 * banks + 0.15 * tufts)
                 } else {
                     0.0
                 };
