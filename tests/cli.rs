@@ -299,8 +299,9 @@ fn a_sweep_of_latencies_says_where_a_driver_breaks_and_saves_table_chart_and_dri
 #[test]
 fn a_program_without_mpi_refuses_to_run_several_times_under_its_launcher() {
     let folder = tempfile::tempdir().unwrap();
-    let started =
-        |ranks: &str| steersman(folder.path()).arg("tracks").env("OMPI_COMM_WORLD_SIZE", ranks).output().unwrap();
+    let started = |ranks: &str| {
+        common::command::steersman(folder.path()).arg("tracks").env("OMPI_COMM_WORLD_SIZE", ranks).output().unwrap()
+    };
     let output = started("2");
     assert_eq!(output.status.code(), Some(1));
     assert!(String::from_utf8_lossy(&output.stderr).contains("--features mpi"));

@@ -194,8 +194,8 @@ pub fn asked_threads() -> usize {
 /// [`Error::Usage`].
 #[cfg(not(feature = "mpi"))]
 pub fn require_alone() -> Result<()> {
-    let several = |name: &&str| std::env::var(name).is_ok_and(|size| size.parse().is_ok_and(|size: usize| size > 1));
-    match ["OMPI_COMM_WORLD_SIZE", "PMI_SIZE"].iter().find(several) {
+    let several = |name: &str| std::env::var(name).is_ok_and(|size| size.parse().is_ok_and(|size: usize| size > 1));
+    match ["OMPI_COMM_WORLD_SIZE", "PMI_SIZE"].into_iter().find(|name| several(name)) {
         None => Ok(()),
         Some(name) => Err(Error::Usage(format!(
             "this program was started several times at once ({name}) but was built without MPI, so each would do all of the work: build \
