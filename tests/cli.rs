@@ -293,3 +293,17 @@ fn a_sweep_of_latencies_says_where_a_driver_breaks_and_saves_table_chart_and_dri
         assert!(refused.contains(message), "{refused}");
     }
 }
+
+/// Several of them would write into the same folder.
+#[cfg(not(feature = "mpi"))]
+#[test]
+fn a_program_without_mpi_refuses_to_run_several_times_under_its_launcher() {
+    let folder = tempfile::tempdir().unwrap();
+    let started = |ranks: &str| {
+        common::command::steersman(folder.path()).arg("tracks").env("OMPI_COMM_WORLD_SIZE", ranks).output().unwrap()
+    };
+    let output = started("2");
+    assert_eq!(output.status.code(), Some(1));
+    assert!(String::from_utf8_lossy(&output.stderr).contains("--features mpi"));
+    assert!(started("1").status.success());
+}

@@ -1,5 +1,5 @@
 //! Several ranks of MPI work as one process does: the same weights for any number of them, also after one was killed. Skipped where
-//! there is no `mpirun`.
+//! there is no `mpirun` of Open MPI.
 
 mod common;
 
@@ -34,10 +34,10 @@ fn json_of_ranks(folder: &Path, ranks: usize, args: &[&str]) -> Value {
 
 /// Whether there is an MPI here; says so if not.
 fn is_here() -> bool {
-    let here = Command::new("mpirun").arg("--version").stdout(Stdio::null()).stderr(Stdio::null()).status();
-    let here = here.is_ok_and(|status| status.success());
+    let version = Command::new("mpirun").arg("--version").output();
+    let here = version.is_ok_and(|output| String::from_utf8_lossy(&output.stdout).contains("Open MPI"));
     if !here {
-        eprintln!("skipped: there is no mpirun");
+        eprintln!("skipped: there is no mpirun of Open MPI");
     }
     here
 }
@@ -183,6 +183,32 @@ fn seeds_that_ranks_drive_come_to_the_same_bytes() {
         compared += 1;
     }
     assert!(compared >= 6, "{compared}");
+}
+
+/// What one rank finds wrong must not leave the others waiting.
+#[test]
+fn a_drive_that_cannot_be_driven_ends_on_all_ranks() {
+    if !is_here() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    for (args, expected) in [
+        (["drive", "zero", "--track", "lake", "--runs", "0"], "at least 1"),
+        (["drive", "zero", "--track", "lake", "--speed", "50"], "3 to 30 mph"),
+        (["drive", "none.safetensors", "--track", "lake", "--runs", "2"], "none.safetensors"),
+    ] {
+        let mut job = mpirun(folder.path(), 2);
+        let job = job.arg(env!("CARGO_BIN_EXE_steersman")).args(args).stdout(Stdio::null()).stderr(Stdio::piped());
+        let mut job = job.spawn().unwrap();
+        let deadline = Instant::now() + Duration::from_secs(60);
+        while job.try_wait().unwrap().is_none() {
+            assert!(Instant::now() < deadline, "{args:?} goes on");
+            sleep(Duration::from_millis(20));
+        }
+        let output = job.wait_with_output().unwrap();
+        let error = String::from_utf8_lossy(&output.stderr);
+        assert!(!output.status.success() && error.contains(expected), "{args:?}: {error}");
+    }
 }
 
 /// Each rank begins in a folder of its own here, as on machines without a common disk.

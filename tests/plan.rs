@@ -251,42 +251,57 @@ impl Ranks for ThreadRanks {
     }
 }
 
+/// Losses and weights after two steps and a pass for statistics with `pairs`, on rank `rank` of those at `table`, or alone.
+fn share_of_training(
+    setup: &Setup,
+    images: usize,
+    pairs: &PairTerms,
+    place: Option<(usize, &Arc<Table>)>,
+) -> (Vec<f64>, Parameters) {
+    let plan = TrainingPlan::new(&setup.network, images);
+    let (mut plan, share) = match place {
+        None => (plan, 0..images),
+        Some((rank, table)) => {
+            let share = share(images, pairs.images() > 0, rank, table.sent.len());
+            (plan.with_ranks(Arc::new(ThreadRanks { rank, table: table.clone() })), share)
+        }
+    };
+    let len = setup.network.input().len();
+    let x = self::images(&setup.network, &setup.x[share.start * len..share.end * len]);
+    let labels = ArrayView1::from(&setup.labels[share]);
+    let (mut optimizer, mut parameters) = (setup.optimizer(), setup.network.initialize(1));
+    let (network, loss) = (&setup.network, &setup.recipe.loss);
+    let mut losses = Vec::new();
+    for step in 0..2 {
+        let input = || StepInput { x, labels, seed: 1, step };
+        losses.push(plan.step_of_share(network, &mut parameters, loss, pairs, input(), images));
+        let norm = plan.gradient_norm();
+        optimizer.step(1e-3, &mut parameters.values, plan.gradient_mut(), norm);
+        plan.pass_statistics(network, &mut parameters, pairs, input(), images);
+    }
+    (losses, parameters)
+}
+
 #[test]
 fn training_gives_the_same_bits_for_any_number_of_processes() {
     let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
+    let smoothness = Smoothness { pairs_share: 0.5, spatial: 2.0, temporal: 3.0 };
+    let paired = PairTerms::new(&smoothness, Pairs { spatial: 5, temporal: 6 });
     for (recipe, size) in NETWORKS {
-        for images in [2, 37, 70] {
+        for (images, pairs) in [(2, PairTerms::default()), (37, paired), (40, paired), (70, PairTerms::default())] {
             let setup = Setup::new(recipe, size, images);
-            let alone = setup.train(2, images);
-            for ranks in [1, 2, 3, 4, 5] {
+            let pool = || rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+            let alone = pool().install(|| share_of_training(&setup, images, &pairs, None));
+            for ranks in [1, 2, 3, 5] {
                 let table = ThreadRanks::table(ranks);
-                let of_rank = |rank: usize| {
-                    let ranks: Arc<dyn Ranks> = Arc::new(ThreadRanks { rank, table: table.clone() });
-                    let mut plan = TrainingPlan::new(&setup.network, images).with_ranks(ranks);
-                    let share = share(images, false, rank, table.sent.len());
-                    let len = setup.network.input().len();
-                    let x = self::images(&setup.network, &setup.x[share.start * len..share.end * len]);
-                    let labels = ArrayView1::from(&setup.labels[share]);
-                    let (mut optimizer, mut parameters) = (setup.optimizer(), setup.network.initialize(1));
-                    let mut step = |_| {
-                        let input = StepInput { x, labels, seed: 1, step: optimizer.updates };
-                        let (network, loss, pairs) = (&setup.network, &setup.recipe.loss, PairTerms::default());
-                        let loss = plan.step_of_share(network, &mut parameters, loss, &pairs, input, images);
-                        let norm = plan.gradient_norm();
-                        optimizer.step(1e-3, &mut parameters.values, plan.gradient_mut(), norm);
-                        loss
-                    };
-                    let losses: Vec<f64> = (0..3).map(&mut step).collect();
-                    (losses, parameters)
-                };
                 std::thread::scope(|scope| {
-                    let threads: Vec<_> = (0..ranks)
-                        .map(|rank| {
-                            let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
-                            let of_rank = &of_rank;
-                            scope.spawn(move || pool.install(|| of_rank(rank)))
+                    let of_rank = |rank| {
+                        let (table, setup, pairs) = (&table, &setup, &pairs);
+                        scope.spawn(move || {
+                            pool().install(|| share_of_training(setup, images, pairs, Some((rank, table))))
                         })
-                        .collect();
+                    };
+                    let threads: Vec<_> = (0..ranks).map(of_rank).collect();
                     for (rank, thread) in threads.into_iter().enumerate() {
                         assert!(thread.join().unwrap() == alone, "{recipe}, {images} images, rank {rank} of {ranks}");
                     }
@@ -424,7 +439,13 @@ fn a_pass_for_statistics_alone_moves_them_as_a_step_does_and_nothing_else() {
         for step in 0..2 {
             let input = || StepInput { x: setup.images(), labels: ArrayView1::from(&setup.labels), seed: 1, step };
             TrainingPlan::new(&setup.network, 9).step(&setup.network, &mut by_step, &setup.recipe.loss, input());
-            TrainingPlan::new(&setup.network, 9).pass_statistics(&setup.network, &mut by_pass, input(), 7);
+            TrainingPlan::new(&setup.network, 9).pass_statistics(
+                &setup.network,
+                &mut by_pass,
+                &PairTerms::default(),
+                input(),
+                7,
+            );
         }
         assert_eq!(by_pass, by_step);
         assert_eq!(by_pass.statistics != fresh.statistics, recipe == "hyper");

@@ -1,5 +1,6 @@
 //! `steersman drive`: closed-loop driving in the simulator.
 
+use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
@@ -17,7 +18,7 @@ use super::words::counted;
 use super::{camera_preset, load_pilot, pool, print, print_json, stop_on_ctrl_c};
 #[cfg(feature = "mpi")]
 use crate::cluster::Team;
-use crate::cluster::{Claim, Order, fingerprint};
+use crate::cluster::{self, Claim, Order, fingerprint};
 use crate::dataset::held_out::trained_on_held_out;
 use crate::error::{Error, Result};
 use crate::files::limits::keep_elsewhere;
@@ -175,6 +176,8 @@ pub fn run(args: DriveArgs) -> Result<()> {
         ));
     }
     let options = args.options()?;
+    // Before other ranks are told of the drive.
+    options.check()?;
     if let Some((swept, values)) = swept {
         return drive_sweep::run(&args, &track, &options, swept, values);
     }
@@ -196,10 +199,10 @@ pub fn run(args: DriveArgs) -> Result<()> {
     let go = |wheel: &Wheel, name: &str, against: bool| {
         if let Some(claim) = &claim {
             claim.order(&Order::Drive {
-                arguments: std::env::args().collect(),
+                arguments: arguments()?,
                 against,
                 fingerprint: args.fingerprint(name),
-                threads: pool.current_num_threads(),
+                threads: cluster::asked_threads(),
             })?;
         }
         pool.install(|| wheel.drive(&track, &options, name, live.as_ref(), &stop, claim.as_ref()))
@@ -273,11 +276,19 @@ pub(super) fn stop_or_ok(stopped: bool) -> Result<()> {
     if stopped { Err(Error::Interrupted) } else { Ok(()) }
 }
 
+/// The command line of this process.
+fn arguments() -> Result<Vec<String>> {
+    let unreadable = |argument: OsString| {
+        Error::Usage(format!("{}: several ranks take arguments in UTF-8 alone", argument.to_string_lossy()))
+    };
+    std::env::args_os().map(|argument| argument.into_string().map_err(unreadable)).collect()
+}
+
 /// Another rank than 0: drives seeds of the drive with these arguments, of `--against` or of the first model.
 #[cfg(feature = "mpi")]
-pub(super) fn help(team: &dyn Team, args: &DriveArgs, against: bool, fingerprint: &str) -> Result<()> {
-    let name = if against { args.against.as_deref().unwrap_or_default() } else { &args.model };
-    let prepare = || {
+pub(super) fn help(team: &dyn Team, args: Result<&DriveArgs>, against: bool, fingerprint: &str) -> Result<()> {
+    let prepare = |args: &DriveArgs| {
+        let name = if against { args.against.as_deref().unwrap_or_default() } else { &args.model };
         if args.fingerprint(name) != fingerprint {
             let message =
                 "here is another file than rank 0 has; every rank must find the same model and track at this place";
@@ -286,7 +297,7 @@ pub(super) fn help(team: &dyn Team, args: &DriveArgs, against: bool, fingerprint
         let (track, wheel) = (Track::load(args.track.as_deref().unwrap_or_default())?, args.wheel(name)?);
         Ok((track, args.options()?, move || Ok(wheel.driver())))
     };
-    help_drive(team, prepare())
+    help_drive(team, args.and_then(prepare))
 }
 
 impl DriveArgs {

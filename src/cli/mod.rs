@@ -154,7 +154,13 @@ pub fn main() -> ExitCode {
     #[cfg(feature = "mpi")]
     return crate::cluster::mpi::run(command, worker::run, |text| eprintln!("{text}"));
     #[cfg(not(feature = "mpi"))]
-    command()
+    match crate::cluster::require_alone() {
+        Ok(()) => command(),
+        Err(error) => {
+            eprintln!("error: {error}");
+            ExitCode::FAILURE
+        }
+    }
 }
 
 fn command() -> ExitCode {

@@ -21,19 +21,28 @@ pub(super) fn run(team: &Arc<dyn Team>) -> ExitCode {
 }
 
 fn follow(team: &Arc<dyn Team>) -> Result<()> {
-    let stop = stop_on_ctrl_c()?;
+    // Rank 0 hears of Ctrl-C itself.
+    let stop = stop_on_ctrl_c().unwrap_or_default();
     // Rank 0 hears of an error of work that was done together; what else there is to do it decides.
     let mut ended = Ok(());
     loop {
         match await_order(&**team)? {
             Order::Train { job, threads } => {
-                ended = pool(threads)?.install(|| training::take_part(team, &job, &stop));
+                ended = match pool(threads) {
+                    Ok(pool) => pool.install(|| training::take_part(team, Ok(&job), &stop)),
+                    Err(error) => training::take_part(team, Err(error), &stop),
+                };
             }
             Order::Drive { arguments, against, fingerprint, threads } => {
-                // Rank 0 runs with these arguments, so they can be read.
-                if let Ok(Cli { command: Command::Drive(args) }) = Cli::try_parse_from(arguments) {
-                    ended = pool(threads)?.install(|| drive::help(&**team, &args, against, &fingerprint));
-                }
+                let args = match Cli::try_parse_from(arguments) {
+                    Ok(Cli { command: Command::Drive(args) }) => Ok(args),
+                    _ => Err(Error::Fault("the arguments of rank 0 cannot be read".into())),
+                };
+                let help = |args| drive::help(&**team, args, against, &fingerprint);
+                ended = match (args, pool(threads)) {
+                    (Ok(args), Ok(pool)) => pool.install(|| help(Ok(&args))),
+                    (Err(error), _) | (_, Err(error)) => help(Err(error)),
+                };
             }
             Order::End => return ended,
         }

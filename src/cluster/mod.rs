@@ -32,7 +32,7 @@ pub mod mpi;
 pub mod tasks;
 
 use std::path::PathBuf;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, OnceLock};
 
 use serde::{Deserialize, Serialize};
@@ -61,6 +61,7 @@ pub trait Team: Ranks {
 
 static TEAM: OnceLock<Arc<dyn Team>> = OnceLock::new();
 static CLAIMED: AtomicBool = AtomicBool::new(false);
+static ASKED_THREADS: AtomicUsize = AtomicUsize::new(0);
 
 /// The team for one piece of work of rank 0, until it is dropped.
 #[derive(Debug)]
@@ -170,13 +171,36 @@ fn dismiss(team: &Arc<dyn Team>) {
 
 /// How many of the cores of this machine are for this process, if others of its team run there too and no `threads` are asked for.
 pub fn threads(threads: usize) -> usize {
+    ASKED_THREADS.store(threads, Ordering::Relaxed);
     match TEAM.get().map(|team| team.on_this_machine()) {
         Some(ranks) if threads == 0 && ranks > 1 => {
             // A launcher that binds its processes to cores has shared them out already.
-            let (allowed, cores) = (std::thread::available_parallelism().map_or(1, usize::from), cores());
-            if allowed < cores { allowed } else { (cores / ranks).max(1) }
+            let allowed = std::thread::available_parallelism().map_or(1, usize::from);
+            allowed.min((cores() / ranks).max(1))
         }
         _ => threads,
+    }
+}
+
+/// The number of threads that the command line of rank 0 asks for; 0 leaves it to each rank.
+pub fn asked_threads() -> usize {
+    ASKED_THREADS.load(Ordering::Relaxed)
+}
+
+/// Fails if a launcher started several of this program, which cannot find each other without the feature `mpi`.
+///
+/// # Errors
+///
+/// [`Error::Usage`].
+#[cfg(not(feature = "mpi"))]
+pub fn require_alone() -> Result<()> {
+    let several = |name: &str| std::env::var(name).is_ok_and(|size| size.parse().is_ok_and(|size: usize| size > 1));
+    match ["OMPI_COMM_WORLD_SIZE", "PMI_SIZE"].into_iter().find(|name| several(name)) {
+        None => Ok(()),
+        Some(name) => Err(Error::Usage(format!(
+            "this program was started several times at once ({name}) but was built without MPI, so each would do all of the work: build \
+             it with --features mpi"
+        ))),
     }
 }
 

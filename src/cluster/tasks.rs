@@ -2,7 +2,7 @@
 //!
 //! Rank 0 works too. A task is a number; its result goes back to rank 0 as bytes, so results lie in the order of the tasks whoever did them.
 
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
 use std::thread;
 use std::time::Duration;
@@ -10,10 +10,10 @@ use std::time::Duration;
 use super::{Claim, Team, await_message, of_rank};
 use crate::error::{Error, Result};
 
-/// How long rank 0 sleeps between two looks at its mail: short beside a task.
+/// How long rank 0 sleeps between two looks for messages: short beside a task.
 const NAP: Duration = Duration::from_micros(300);
 
-/// What a message of a helper begins with.
+/// What a message to rank 0 begins with.
 const ASKS: u8 = 0;
 const DONE: u8 = 1;
 const FAILED: u8 = 2;
@@ -31,7 +31,12 @@ pub fn spread<T: Send>(
 ) -> Vec<Result<T>> {
     let team = &**claim.team();
     let next = AtomicUsize::new(0);
-    let draw = || Some(next.fetch_add(1, Ordering::Relaxed)).filter(|task| *task < count && !stopped());
+    // The error of a rank ends the work of all.
+    let broken = AtomicBool::new(false);
+    let draw = || {
+        let goes_on = !broken.load(Ordering::Relaxed) && !stopped();
+        goes_on.then(|| next.fetch_add(1, Ordering::Relaxed)).filter(|task| *task < count)
+    };
     let results: Mutex<Vec<Result<T>>> = Mutex::new((0..count).map(|_| Err(Error::Interrupted)).collect());
     let keep = |task: usize, result: Result<T>| {
         let mut results = results.lock().unwrap_or_else(PoisonError::into_inner);
@@ -42,8 +47,8 @@ pub fn spread<T: Send>(
     let failed = Mutex::new(None);
     thread::scope(|scope| {
         scope.spawn(|| {
-            let mut helpers = team.size() - 1;
-            while helpers > 0 {
+            let mut workers = team.size() - 1;
+            while workers > 0 {
                 let Some((rank, message)) = team.try_receive() else {
                     thread::sleep(NAP);
                     continue;
@@ -52,10 +57,14 @@ pub fn spread<T: Send>(
                 let error = || of_rank(rank, team.size(), &String::from_utf8_lossy(content));
                 match kind {
                     DONE => keep(task, take(content)),
-                    FAILED => keep(task, Err(error())),
+                    FAILED => {
+                        broken.store(true, Ordering::Relaxed);
+                        keep(task, Err(error()));
+                    }
                     LEAVES => {
-                        helpers -= 1;
+                        workers -= 1;
                         if !content.is_empty() {
+                            broken.store(true, Ordering::Relaxed);
                             *failed.lock().unwrap_or_else(PoisonError::into_inner) = Some(error());
                         }
                         continue;

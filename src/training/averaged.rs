@@ -6,6 +6,7 @@ use super::checkpoint::State;
 use super::data::images;
 use super::together::Together;
 use crate::dataset::loader::{Batch, Loader};
+use crate::engine::loss::{PairTerms, Smoothness};
 use crate::engine::network::{Network, StepInput, TrainingPlan};
 use crate::error::Result;
 
@@ -39,7 +40,8 @@ pub(super) fn refit_statistics(
                 if current.n > 0 {
                     let (x, labels) = (images(network.input(), current), ArrayView1::from(&current.labels));
                     let input = StepInput { x, labels, seed, step: batch as u64 };
-                    plan.pass_statistics(network, parameters, input, current.n);
+                    let pairs = PairTerms::new(&Smoothness::default(), current.pairs);
+                    plan.pass_statistics(network, parameters, &pairs, input, current.n);
                 }
             },
             || if batch + 1 < batches { together.fill(training, batch + 1, next) } else { Ok(true) },

@@ -168,7 +168,8 @@ pub fn resume_with(
         return Err(Error::data(folder.file("run.json"), message));
     }
     // Runs of older versions have no such hash.
-    if !info.pictures_hash.is_empty() && data.pictures_hash() != info.pictures_hash {
+    let pictures_hash = data.pictures_hash();
+    if !info.pictures_hash.is_empty() && pictures_hash != info.pictures_hash {
         let message =
             "pictures of the recordings have changed since the run began; it can only go on with the same pictures";
         return Err(Error::data(folder.file("run.json"), message));
@@ -178,7 +179,8 @@ pub fn resume_with(
     }
     let from = info.transfer.as_ref().map(TransferRequest::of);
     let start = from.map(|from| Start::load(&folder.from(), &from, &recipe, info.seed)).transpose()?;
-    let given = info.clone();
+    // Runs of older versions have no hash of the pictures.
+    let given = RunInfo { pictures_hash, ..info.clone() };
     let mut run = TrainingRun::new((folder, Some(lock)), info, recipe, data, start, started)?.measured(profile);
     run.restore()?;
     let _claim = together::invite(&mut run, &given)?;

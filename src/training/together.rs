@@ -10,7 +10,7 @@ use super::checkpoint::State;
 use super::data::Data;
 use super::run::TrainingRun;
 use super::run_folder::{RunFolder, RunInfo};
-use crate::cluster::{Claim, Order, Team, agree};
+use crate::cluster::{self, Claim, Order, Team, agree};
 use crate::dataset::loader::{Batch, Loader};
 use crate::engine::network::share;
 use crate::error::{Error, Result};
@@ -61,7 +61,20 @@ impl Together {
 
     /// The end of [`fill`](Together::fill), where `complete` is the answer of all.
     pub fn settle(&self, loader: &Loader, out: &mut Batch, complete: bool) -> Result<()> {
-        loader.settle(out, complete, &|images, pairs| self.share(images, pairs))
+        if let Some(team) = self.team.as_ref().filter(|_| !complete) {
+            // All ranks leave out what one of them could not decode, and so have batches of the same size.
+            self.meet(loader.make_whole(out).map(|()| true), Ok(()))?;
+            let told = serde_json::to_vec(&loader.losses(out)).map_err(|e| Error::Fault(e.to_string()));
+            let losses = team.gather_bytes(&agree(&**team, told)?);
+            let read = losses.iter().try_for_each(|bytes| {
+                let losses = serde_json::from_slice(bytes).map_err(|e| Error::Fault(e.to_string()))?;
+                loader.take_losses(out, losses);
+                Ok(())
+            });
+            agree(&**team, read)?;
+        }
+        loader.settle(out, complete, &|images, pairs| self.share(images, pairs));
+        Ok(())
     }
 
     /// Where all ranks meet after a step: an error of one ends the work of all, and the answer is whether all of them `filled` their share
@@ -69,16 +82,19 @@ impl Together {
     pub fn meet(&self, filled: Result<bool>, ended: Result<()>) -> Result<bool> {
         let mine = filled.and_then(|complete| ended.map(|()| complete));
         let Some(team) = &self.team else { return mine };
+        const COMPLETE: f64 = 0.0;
+        const INCOMPLETE: f64 = 1.0;
+        const FAILED: f64 = 2.0;
         let told = match &mine {
-            Ok(true) => 0.0,
-            Ok(false) => 1.0,
-            Err(_) => 2.0,
+            Ok(true) => COMPLETE,
+            Ok(false) => INCOMPLETE,
+            Err(_) => FAILED,
         };
         let counts = vec![1; team.size()];
-        let mut all = vec![0.0; team.size()];
+        let mut all = vec![COMPLETE; team.size()];
         team.gather_f64(&[told], &counts, &mut all);
-        let most = all.iter().fold(0.0, |most: f64, told| most.max(*told));
-        if most > 1.0 { agree(&**team, mine) } else { Ok(most < 1.0) }
+        let worst = all.iter().fold(COMPLETE, |worst: f64, told| worst.max(*told));
+        if worst == FAILED { agree(&**team, mine) } else { Ok(worst == COMPLETE) }
     }
 
     /// The `values` of all ranks, one rank after the other, where rank `r` has those of its share of a batch of `images`, `each` of every
@@ -108,7 +124,7 @@ pub(super) fn invite(run: &mut TrainingRun, given: &RunInfo) -> Result<Option<Cl
     let job = Job { info: given.clone(), recipe_name, recipe };
     let job = serde_json::to_string(&job).map_err(|e| Error::Fault(format!("the run cannot be told: {e}")))?;
     let state = run.state.to_bytes(STATE.as_ref(), &run.network)?;
-    claim.order(&Order::Train { job, threads: rayon::current_num_threads() })?;
+    claim.order(&Order::Train { job, threads: cluster::asked_threads() })?;
     let team = claim.team().clone();
     agree(&*team, Ok(()))?;
     team.gather_bytes(&state);
@@ -116,13 +132,13 @@ pub(super) fn invite(run: &mut TrainingRun, given: &RunInfo) -> Result<Option<Cl
     Ok(Some(claim))
 }
 
-/// Another rank: takes part in the run that `job` describes, until it ends. Call it inside a rayon pool.
+/// Another rank: takes part in the run that `job` describes, until it ends; an error in its place tells rank 0 why this one cannot. Call it inside a rayon pool.
 ///
 /// # Errors
 ///
 /// [`Error::Data`] if the recordings are others than those of rank 0, and as [`train`](super::train). Rank 0 knows of every error.
-pub fn take_part(team: &Arc<dyn Team>, job: &str, stop: &StopSignal) -> Result<()> {
-    let prepared = prepare(job);
+pub fn take_part(team: &Arc<dyn Team>, job: Result<&str>, stop: &StopSignal) -> Result<()> {
+    let prepared = job.and_then(prepare);
     let (prepared, mine) = match prepared {
         Ok(run) => (Some(run), Ok(())),
         Err(error) => (None, Err(error)),

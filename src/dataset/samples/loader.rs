@@ -25,6 +25,8 @@ use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 mod sample;
 mod share;
 
+pub use share::Losses;
+
 /// Everything that decides what batches look like.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LoaderSpec {
@@ -362,7 +364,8 @@ impl Loader {
     pub fn fill(&self, batch: usize, out: &mut Batch) -> Result<()> {
         let whole = |n: usize, _: bool| 0..n;
         let complete = self.fill_share(batch, out, &whole)?;
-        self.settle(out, complete, &whole)
+        self.settle(out, complete, &whole);
+        Ok(())
     }
 
     /// The first half of [`fill`](Loader::fill), where this process has but a share of the batch: `share` says which of so many samples,

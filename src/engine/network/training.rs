@@ -42,7 +42,7 @@ pub(super) struct GroupLimits {
 }
 
 /// About 2 MiB between barriers: less would fit the second-level cache, but the weight gradient wants several images of a small map
-/// in a call. About 1 MiB without barriers, but 8 images, because the weight gradient has a cost for each call.
+/// in a call. About 1 MiB without barriers, but 8 images where a shard has as many, because the weight gradient has a cost for each call.
 pub(super) const GROUP_LIMITS: GroupLimits =
     GroupLimits { segment_numbers: 512 * 1024, group_numbers: 256 * 1024, min_group: 8 };
 
@@ -296,15 +296,22 @@ impl TrainingPlan {
     }
 
     /// Lets the running statistics go on over one batch as [`step`](TrainingPlan::step) does, and changes nothing else: the forward
-    /// pass alone, as far as the last batch normalisation. Without any it does nothing. `input` and `of` are as in
+    /// pass alone, as far as the last batch normalisation. Without any it does nothing. `pairs`, `input` and `of` are as in
     /// [`step_of_share`](TrainingPlan::step_of_share).
     ///
     /// # Panics
     ///
     /// As [`step_of_share`](TrainingPlan::step_of_share).
-    pub fn pass_statistics(&mut self, network: &Network, parameters: &mut Parameters, input: StepInput, of: usize) {
+    pub fn pass_statistics(
+        &mut self,
+        network: &Network,
+        parameters: &mut Parameters,
+        pairs: &PairTerms,
+        input: StepInput,
+        of: usize,
+    ) {
         if self.segments.len() > 1 {
-            let (input, used) = self.begin_step(network, parameters, &PairTerms::default(), input, of);
+            let (input, used) = self.begin_step(network, parameters, pairs, input, of);
             self.forward_with_barriers(network, parameters, None, input, used);
         }
     }
