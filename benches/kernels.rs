@@ -12,7 +12,6 @@ use steersman_kernels::conv::{Conv, ConvAlgorithm, ConvShape, PooledConv};
 use steersman_kernels::gemm::{gemm, gemm_scratch_len};
 use steersman_kernels::matrix::{Matrix, MatrixMut};
 use steersman_kernels::norm_rectify::{self, ChannelMeans, ChannelStatistics, RectifyShape, Slopes};
-
 use steersman_kernels::pool::{self, PoolShape};
 use steersman_kernels::sgemm::sgemm;
 use steersman_kernels::{Backend, Isa, activation, norm, peak, update};
