@@ -34,9 +34,9 @@ pub fn run(
     if LAUNCHERS.iter().all(|name| std::env::var_os(name).is_none()) {
         return lead();
     }
-    let Some((_universe, threading)) = mpi::initialize_with_threading(Threading::Serialized) else { return lead() };
+    let Some((universe, threading)) = mpi::initialize_with_threading(Threading::Serialized) else { return lead() };
     let work = || -> ExitCode {
-        let team = match join(&_universe, threading, &say) {
+        let team = match join(&universe, threading, &say) {
             Ok(team) => team,
             Err(error) => {
                 if SimpleCommunicator::world().rank() == 0 {
@@ -60,8 +60,8 @@ pub fn run(
 }
 
 /// Agrees with the other ranks on program and instruction set.
-fn join(_: &Universe, threading: Threading, say: &impl Fn(&str)) -> Result<Arc<dyn Team>> {
-    let world = SimpleCommunicator::world();
+fn join(universe: &Universe, threading: Threading, say: &impl Fn(&str)) -> Result<Arc<dyn Team>> {
+    let world = universe.world();
     let node = world.split_shared(world.rank());
     let team: Arc<dyn Team> = Arc::new(MpiTeam {
         rank: world.rank() as usize,
