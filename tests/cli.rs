@@ -259,6 +259,16 @@ fn bench_prints_every_figure() {
     assert!(number(&result["profile"], "update_ms") > 0.0, "{result}");
 }
 
+/// Steering and throttle: every image has two numbers.
+#[test]
+fn bench_measures_a_network_with_two_outputs() {
+    let arguments = ["bench", "--recipe", "donkey", "--batch", "2", "--seconds", "0.05", "--json"];
+    let result = json(Path::new("."), &arguments);
+    for key in ["train_images_per_second", "infer_us_p50", "infer_images_per_second"] {
+        assert!(number(&result, key) > 0.0, "{key}: {result}");
+    }
+}
+
 #[test]
 fn a_sweep_of_latencies_says_where_a_driver_breaks_and_saves_table_chart_and_drives() {
     let folder = tempfile::tempdir().unwrap();

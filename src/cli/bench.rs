@@ -255,7 +255,7 @@ fn images<'a>(network: &Network, x: &'a [f32]) -> ArrayView4<'a, f32> {
 
 fn infer_throughput(network: &Network, parameters: &Parameters, x: &[Vec<f32>], args: &BenchArgs) -> f64 {
     let mut plan = InferencePlan::new(network, args.batch);
-    let mut y = vec![0.0; args.batch];
+    let mut y = vec![0.0; args.batch * network.output().len()];
     plan.run(network, parameters, images(network, &x[0]), ArrayViewMut1::from(&mut y));
     let (mut batches, started) = (0, Instant::now());
     while started.elapsed().as_secs_f64() < args.seconds {
@@ -270,11 +270,12 @@ fn infer_latency(network: Network, parameters: Parameters, x: &[f32], seconds: f
     let mut predictor = Predictor::new(network, parameters, 1);
     let mut times = Vec::new();
     let started = Instant::now();
-    let image_len = predictor.network().input().len();
+    let (image_len, outputs) = (predictor.network().input().len(), predictor.network().output().len());
+    let mut y = vec![0.0; outputs];
     for image in x.chunks_exact(image_len).cycle() {
         let image = images(predictor.network(), image);
         let before = Instant::now();
-        predictor.run(image, ArrayViewMut1::from(&mut [0.0]));
+        predictor.run(image, ArrayViewMut1::from(&mut y));
         times.push(before.elapsed().as_secs_f64() * 1e6);
         if started.elapsed().as_secs_f64() >= seconds {
             break;

@@ -67,7 +67,7 @@ pub struct World {
     pub road: Vec<RoadCell>,
     /// Length of a lap in texture metres; a whole number of periods.
     pub road_length_m: f32,
-    /// Surfaces: of each look one, or one for each [`SUN_SIDES`] if it has raised edges.
+    /// Surfaces: of each look one, or one for each `SUN_SIDES` if it has raised edges.
     pub textures: Vec<RoadTexture>,
     /// Objects beside the road.
     pub sprites: Vec<Sprite>,
