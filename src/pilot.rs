@@ -150,10 +150,15 @@ impl Pilot {
     /// As [`steer`](Self::steer).
     pub fn answer(&mut self, image: ArrayView3<u8>) -> Result<Answer> {
         self.preprocess(image)?;
+        self.run_network();
+        Ok(self.last_answer())
+    }
+
+    /// The outputs for the network's input.
+    fn run_network(&mut self) {
         let input = ArrayView4::from_shape(self.predictor.network().input().batch(1), &self.input);
         let input = input.expect("preprocessing gives an image of the network's input shape");
         self.predictor.run(input, ArrayViewMut1::from(&mut self.outputs));
-        Ok(self.last_answer())
     }
 
     /// The outputs of the last call by their names.
@@ -197,7 +202,7 @@ impl Pilot {
     }
 
     /// [`steer`](Self::steer) that calls `seen` with the index in [`Network::layers`] and the output, `[c][h][w]`, of each layer that
-    /// computes something.
+    /// computes something. The answer has the bits of `steer`; what is seen is computed apart, layer by layer, up to rounding.
     ///
     /// # Errors
     ///
@@ -207,6 +212,8 @@ impl Pilot {
         let (network, parameters) = (self.predictor.network(), self.predictor.parameters());
         let plan = self.observation.get_or_insert_with(|| ObservationPlan::new(network));
         plan.run(network, parameters, &self.input, &mut self.outputs, seen);
+        // Layers that run as one may round otherwise.
+        self.run_network();
         Ok(self.outputs[0])
     }
 
