@@ -12,7 +12,7 @@ use steersman::simulator::{RecordOptions, Track, record};
 /// Every ninth frame of a 10 Hz drive: neighbours stay within the second that makes them one session.
 const EVERY: usize = 9;
 /// JPEG quality, low enough for 300 kB in all.
-const QUALITY: u8 = 20;
+const QUALITY: u8 = 16;
 const MAX_BYTES: u64 = 300_000;
 
 /// Draws the sample log into `folder`.

@@ -103,7 +103,7 @@ fn every_option_of_record_makes_a_recording_that_inspect_reads_whole() {
 
 /// A change to a built-in track file that makes it a bad one, and what the error must say.
 const BAD_TRACKS: [(&str, &str, &str, &[&str]); 9] = [
-    ("key", "hills_m = 16.0", "hils_m = 16.0", &["bad.toml:", "hils_m", "hills_m"]),
+    ("key", "hills_m = 20.0", "hils_m = 20.0", &["bad.toml:", "hils_m", "hills_m"]),
     ("type", "held_out = false", "held_out = 3", &["bad.toml:3: ", "bool"]),
     ("grain", "grain = 0.6", "grain = 7.0", &["bad.toml: look `bridge`: grain is 7; 0 to 1"]),
     ("sun", "sun_elevation_deg = 48.0", "sun_elevation_deg = nan", &["sun_elevation_deg", "5 to 85"]),
