@@ -133,11 +133,6 @@ impl Conv {
         &self.shape
     }
 
-    /// The instruction set it runs on.
-    pub fn isa(&self) -> Isa {
-        self.backend.isa
-    }
-
     /// What it runs on.
     pub fn backend(&self) -> Backend {
         self.backend
