@@ -13,7 +13,7 @@
 //!
 //! # Where things are
 //! [`isa`] detection · [`conv`] convolution and its gradients, with the menu of its algorithms · [`im2col`] an image as a
-//! matrix of patches, and back · [`gemm`] and [`sgemm`] matrix products · [`pool`] max and average pooling · [`blur`] binomial blur · [`activation`] ·
+//! matrix of patches, and back · [`gemm`] and [`sgemm`] matrix products · [`pool`] max and average pooling · [`blur`] binomial blur · [`mod@dropout`] · [`activation`] ·
 //! [`norm`] batch normalisation · [`norm_rectify`] batch normalisation, rectifier and pooling in one pass · [`update`]
 //! optimiser steps · [`pixels`] bytes to floats · [`peak`] the multiply-add peak of a core · [`mod@reference`] the naive
 //! loops that define each kernel.
@@ -39,6 +39,7 @@ pub mod blur;
 pub mod conv;
 mod conv_algorithm;
 mod conv_shape;
+pub mod dropout;
 pub mod gemm;
 pub mod im2col;
 pub mod matrix;

@@ -2,7 +2,7 @@
 
 use rand::Rng;
 use serde::{Deserialize, Serialize};
-use steersman_kernels::Backend;
+use steersman_kernels::{Backend, Isa, dropout};
 
 use super::{ExportForm, Family, Grads, Layer, LayerKind, Pair, Pass, ReceptiveField};
 use crate::engine::random::{Purpose, rng};
@@ -23,15 +23,16 @@ use crate::engine::tensor::Shape;
 pub struct Dropout {
     shape: Shape,
     drop_probability: f32,
+    isa: Isa,
 }
 
 impl Dropout {
     /// Drops elements of maps of `shape` with `drop_probability` in [0, 1).
-    pub fn new(shape: Shape, drop_probability: f32) -> Result<Dropout, String> {
+    pub fn new(shape: Shape, drop_probability: f32, isa: Isa) -> Result<Dropout, String> {
         if !(0.0..1.0).contains(&drop_probability) {
             return Err(format!("drop_probability must lie in [0, 1), not be {drop_probability}"));
         }
-        Ok(Dropout { shape, drop_probability })
+        Ok(Dropout { shape, drop_probability, isa })
     }
 
     fn apply(&self, pass: &Pass, from: &[f32], to: &mut [f32]) {
@@ -39,15 +40,14 @@ impl Dropout {
             return to.copy_from_slice(from);
         }
         let keep_scale = 1.0 / (1.0 - self.drop_probability);
-        // An element is dropped when 32 random bits, as a fraction of 2³², are below the probability.
+        // An element is dropped when its 32 random bits, as a fraction of 2³², are below the probability.
         let threshold = (f64::from(self.drop_probability) * 4_294_967_296.0) as u32;
         let images = from.chunks_exact(self.shape.len()).zip(to.chunks_exact_mut(self.shape.len()));
         for (image, (from, to)) in images.enumerate() {
             let stream = ((pass.layer as u64) << 32) | (pass.first_image + image) as u64;
             let mut bits = rng(pass.seed, Purpose::Dropout, pass.step, stream);
-            for (to, from) in to.iter_mut().zip(from) {
-                *to = if bits.next_u32() < threshold { 0.0 } else { from * keep_scale };
-            }
+            let key = [bits.next_u32(), bits.next_u32()];
+            dropout::dropout(self.isa, key, threshold, keep_scale, from, to);
         }
     }
 }
@@ -105,8 +105,8 @@ impl LayerKind for DropoutSpec {
         Ok(())
     }
 
-    fn layer(&self, input: Shape, _backend: Backend) -> Result<Box<dyn Layer>, String> {
-        Ok(Box::new(Dropout::new(input, self.drop_probability)?))
+    fn layer(&self, input: Shape, backend: Backend) -> Result<Box<dyn Layer>, String> {
+        Ok(Box::new(Dropout::new(input, self.drop_probability, backend.isa)?))
     }
 
     fn export_form(&self, _input: Shape, _params: &[f32], _statistics: &[f32]) -> ExportForm {
@@ -131,13 +131,13 @@ mod tests {
 
     #[test]
     fn gradients_hold() {
-        check_layer(&Dropout::new(Shape::new(2, 3, 5), 0.3).unwrap(), 3);
-        check_layer(&Dropout::new(Shape::vector(7), 0.0).unwrap(), 1);
+        check_layer(&Dropout::new(Shape::new(2, 3, 5), 0.3, Isa::best()).unwrap(), 3);
+        check_layer(&Dropout::new(Shape::vector(7), 0.0, Isa::best()).unwrap(), 1);
     }
 
     #[test]
     fn the_named_fraction_is_dropped_and_the_mean_kept() {
-        let layer = Dropout::new(Shape::vector(1000), 0.2).unwrap();
+        let layer = Dropout::new(Shape::vector(1000), 0.2, Isa::best()).unwrap();
         let y = drop(&layer, &pass(0, 0, 0), &[1.0; 100_000]);
         let dropped = y.iter().filter(|y| **y == 0.0).count() as f64 / 100_000.0;
         let mean = y.iter().map(|y| f64::from(*y)).sum::<f64>() / 100_000.0;
@@ -147,7 +147,7 @@ mod tests {
 
     #[test]
     fn step_layer_and_image_each_change_what_is_dropped() {
-        let layer = Dropout::new(Shape::vector(100), 0.5).unwrap();
+        let layer = Dropout::new(Shape::vector(100), 0.5, Isa::best()).unwrap();
         let x = [1.0; 100];
         let first = drop(&layer, &pass(0, 0, 0), &x);
         assert_eq!(first, drop(&layer, &pass(0, 0, 0), &x));
@@ -158,14 +158,14 @@ mod tests {
 
     #[test]
     fn an_image_loses_the_same_elements_wherever_the_batch_is_cut() {
-        let layer = Dropout::new(Shape::vector(100), 0.5).unwrap();
+        let layer = Dropout::new(Shape::vector(100), 0.5, Isa::best()).unwrap();
         let together = drop(&layer, &pass(3, 2, 0), &[1.0; 300]);
         assert_eq!(together[200..], drop(&layer, &pass(3, 2, 2), &[1.0; 100]));
     }
 
     #[test]
     fn evaluation_is_the_identity() {
-        let layer = Dropout::new(Shape::vector(3), 0.9).unwrap();
+        let layer = Dropout::new(Shape::vector(3), 0.9, Isa::best()).unwrap();
         let mut y = [f32::NAN; 3];
         layer.infer(&[], &[], 1, &[1., 2., 3.], &mut y, &mut []);
         assert_eq!(y, [1., 2., 3.]);

@@ -11,7 +11,7 @@ pub(super) const MAX_SHARDS: usize = 64;
 
 /// A larger batch has more shards and not larger ones, as long as there are fewer than [`MAX_SHARDS`]. A batch of fewer images than
 /// 16 times this has 16 shards. The weight gradient of a convolution wants some images in a call.
-const SHARD_IMAGES: usize = 4;
+const SHARD_IMAGES: usize = 8;
 const FEW_SHARDS: usize = 16;
 
 /// The shards of a batch.
@@ -164,7 +164,7 @@ mod tests {
             }
         }
         let counts = [1, 16, 64, 128, 256, 384, 1024].map(|images| Sharding::new(images, false).count());
-        assert_eq!(counts, [1, 16, 16, 32, 64, 64, 64]);
+        assert_eq!(counts, [1, 16, 16, 16, 32, 48, 64]);
     }
 
     /// The sum as text with its brackets: what any grouping into subtrees must give again.
