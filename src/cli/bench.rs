@@ -10,7 +10,9 @@ use steersman_kernels::conv::ConvAlgorithm;
 use steersman_kernels::peak::measure_peak_gflops;
 use steersman_kernels::{Backend, Isa};
 
-use super::{RecipeArgs, pool, print_json};
+use super::arguments::RecipeArgs;
+use super::process::pool;
+use super::terminal::print_json;
 use crate::engine::network::{InferencePlan, Network, Parameters, Predictor, StageTime, StepInput, TrainingPlan};
 use crate::engine::optimizer::Optimizer;
 use crate::engine::random::{Purpose, rng, uniform};

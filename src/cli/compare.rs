@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use super::refuse_existing;
+use super::arguments::refuse_existing;
 use crate::error::Result;
 use crate::files::atomic_file;
 use crate::report::pages::comparison;

@@ -5,8 +5,9 @@ use std::path::PathBuf;
 use clap::Args;
 use steersman_kernels::Isa;
 
-use super::recording_args::RecordingArgs;
-use super::{load_model, or_dash, pool, print_json};
+use super::arguments::{RecordingArgs, load_model};
+use super::process::pool;
+use super::terminal::{or_dash, print_json};
 use crate::dataset::held_out::trained_on_held_out;
 use crate::error::Result;
 use crate::evaluation::{EvaluateRequest, EvaluationEvent, LOOK_AHEAD_S, evaluate};

@@ -5,9 +5,9 @@ use std::path::PathBuf;
 use clap::Args;
 use serde::Serialize;
 
-use super::recording_args::RecordingArgs;
-use super::share_bar::ShareBar;
-use super::{load_pilot, new_folder, pool, print, print_json, refuse_existing, stop_on_ctrl_c};
+use super::arguments::{RecordingArgs, load_pilot, new_folder, refuse_existing};
+use super::process::{pool, stop_on_ctrl_c};
+use super::terminal::{ShareBar, print, print_json};
 use crate::error::{Error, Result};
 use crate::files::atomic_file;
 use crate::report::explain::counterfactual::{Counterfactuals, examine};

@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 use clap::{Args, ValueEnum};
 use serde::Serialize;
 
-use super::model_arg::model_file;
-use super::{load_model, print, print_json};
+use super::arguments::{load_model, model_file};
+use super::terminal::{print, print_json};
 use crate::error::{Error, Result};
 use crate::exchange::onnx::{OPSET, OnnxOptions, onnx};
 use crate::exchange::source::{Language, source};

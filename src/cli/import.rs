@@ -7,8 +7,9 @@ use clap::Args;
 use serde::Serialize;
 use steersman_kernels::Isa;
 
-use super::recording_args::RecordingArgs;
-use super::{or_dash, pool, print, print_json};
+use super::arguments::RecordingArgs;
+use super::process::pool;
+use super::terminal::{or_dash, print, print_json};
 use crate::dataset::colour::Colour;
 use crate::dataset::preprocess::Preprocessing;
 use crate::dataset::resize::Interpolation;

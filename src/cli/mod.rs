@@ -1,73 +1,44 @@
-//! The commands, one file each: its arguments and `run`.
+//! The commands, one file or folder each, by its name: its arguments and `run`. What several commands take lies in `arguments/`, how
+//! they print and show progress in `terminal/`, threads and Ctrl-C in `process.rs`.
 //!
 //! Results go to standard output, everything else to standard error. With `--json` the last line of standard output is one
 //! JSON value. Exit codes: 0 done, 1 error, 2 wrong arguments, 130 interrupted.
 
-/// As that of the standard library, but foreign text reaches no terminal raw (see [`crate::text`]), and whoever reads may stop
-/// before the end, as `head` does. All commands print through this macro, [`eprintln`], [`print`] and [`print_json`].
-macro_rules! println {
-    () => { $crate::cli::print_line(std::io::stdout(), "") };
-    ($($arg:tt)+) => { $crate::cli::print_line(std::io::stdout(), &format!($($arg)+)) };
-}
+#[macro_use]
+mod terminal;
 
-/// As [`println`], to standard error.
-macro_rules! eprintln {
-    ($($arg:tt)+) => { $crate::cli::print_line(std::io::stderr(), &format!($($arg)+)) };
-}
-
+pub(crate) mod arguments;
 mod bench;
 mod compare;
-mod donkeysim;
 mod drive;
-mod drive_donkeysim;
-mod drive_sweep;
 mod evaluate;
 mod experiment;
-mod experiment_replay;
 mod explain;
 pub(crate) mod export;
-mod fit_camera;
 mod import;
 mod inspect;
-pub(crate) mod model_arg;
 mod predict;
-mod progress;
+mod process;
 mod record;
-mod recording_args;
-mod replay;
 mod runs;
 mod serve;
-mod share_bar;
 mod sim;
 pub(crate) mod summary;
-mod terminal;
-pub(crate) mod throttle;
 mod tracks;
 mod train;
-mod verdict;
 mod video;
-mod words;
 #[cfg(feature = "mpi")]
 mod worker;
 
-use std::io::{self, IsTerminal, Write};
-use std::path::Path;
 use std::process::ExitCode;
 use std::time::Instant;
 
 use clap::error::{ContextKind, ContextValue, ErrorKind};
-use clap::{Args, CommandFactory, Parser, Subcommand};
-use serde::Serialize;
+use clap::{CommandFactory, Parser, Subcommand};
 
-use crate::error::{Error, Result};
-use crate::geometry::CarGeometry;
-use crate::model_file::{Model, notice_without_digest};
-use crate::observer::StopSignal;
-use crate::pilot::Pilot;
+use crate::error::Error;
 use crate::recipe::Recipe;
-use crate::simulator::camera_trouble;
-use crate::text::{escaped, escaped_json, escaped_lines};
-use model_arg::model_file;
+use crate::text::escaped_lines;
 
 /// Learn to steer a car from its front camera, and drive with what was learned.
 #[derive(Debug, Parser)]
@@ -231,147 +202,4 @@ fn recipe_entry(error: &clap::Error, args: Vec<String>) -> Option<String> {
     };
     let key = Recipe::key_like(unknown.split('=').next()?.trim_start_matches('-'))?;
     Some(format!("{key} is an entry of the recipe: use --set {key}={value}"))
-}
-
-/// Which recipe, and what to change in it.
-#[derive(Clone, Debug, Args)]
-struct RecipeArgs {
-    /// A built-in recipe (default, calm, recording, hyper, hyper-prelu, lenet, pilotnet, donkey) or a recipe file [default: recording
-    /// with a recording, else default]
-    #[arg(long, value_name = "NAME|FILE")]
-    recipe: Option<String>,
-    /// Change an entry of the recipe, as in epochs=3 or optimizer.learning_rate=1e-4
-    #[arg(long = "set", value_name = "KEY=VALUE")]
-    overrides: Vec<String>,
-}
-
-impl RecipeArgs {
-    fn is_given(&self) -> bool {
-        self.recipe.is_some() || !self.overrides.is_empty()
-    }
-
-    fn find(&self) -> Result<Recipe> {
-        self.find_or("default")
-    }
-
-    /// The recipe that is named, or else the built-in one called `default`.
-    fn find_or(&self, default: &str) -> Result<Recipe> {
-        Recipe::find(self.recipe.as_deref().unwrap_or(default), &self.overrides)
-    }
-
-    /// The recipe that is named, or else that of the model in the file `from`.
-    fn find_or_of(&self, from: &Path) -> Result<Recipe> {
-        match self.recipe {
-            Some(_) => self.find(),
-            None => Recipe::parse(&from.display().to_string(), &load_model(from)?.recipe.to_toml()?, &self.overrides),
-        }
-    }
-}
-
-/// Reads the model that `given` means, and says so if it has no digest.
-fn load_model(given: &Path) -> Result<Model> {
-    let path = &model_file(given)?;
-    let model = Model::load(path)?;
-    say_if_without_digest(path)?;
-    Ok(model)
-}
-
-/// Reads the model that `given` means to drive with it, and says so if it has no digest.
-fn load_pilot(given: &Path) -> Result<Pilot> {
-    let path = &model_file(given)?;
-    let pilot = Pilot::load(path)?;
-    say_if_without_digest(path)?;
-    Ok(pilot)
-}
-
-fn say_if_without_digest(path: &Path) -> Result<()> {
-    if let Some(notice) = notice_without_digest(path)?.filter(|_| !crate::cluster::follows()) {
-        eprintln!("note: {}", escaped(&notice));
-    }
-    Ok(())
-}
-
-/// The camera and the car of the preset `name`, which the simulator must be able to have.
-fn camera_preset(name: &str) -> Result<CarGeometry> {
-    let known = || CarGeometry::presets().map(|(name, _)| name).collect::<Vec<_>>().join(", ");
-    let car = CarGeometry::preset(name)
-        .ok_or_else(|| Error::Usage(format!("--camera {name}: there is no such camera; known are {}", known())))?;
-    match camera_trouble(&car) {
-        Some(trouble) => Err(Error::Usage(format!("--camera {name}: {trouble}"))),
-        None => Ok(car),
-    }
-}
-
-/// A rayon pool of `threads` (0: one for each core, which the ranks on a machine share out).
-fn pool(threads: usize) -> Result<rayon::ThreadPool> {
-    let threads = crate::cluster::threads(threads);
-    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
-    pool.map_err(|e| {
-        Error::System(format!("cannot start {threads} threads: {e}; give a smaller number with --threads"))
-    })
-}
-
-/// A signal that Ctrl-C gives; the second Ctrl-C ends the process at once.
-fn stop_on_ctrl_c() -> Result<StopSignal> {
-    let stop = StopSignal::default();
-    let signal = stop.clone();
-    let handler = move || {
-        if signal.request() {
-            std::process::exit(130);
-        }
-    };
-    ctrlc::set_handler(handler).map_err(|e| Error::System(format!("cannot listen for Ctrl-C: {e}")))?;
-    Ok(stop)
-}
-
-/// The end of a command that went on after some of its inputs `failed`: the last error ends it, those before are told.
-fn end_with(mut failed: Vec<Error>) -> Result<()> {
-    let last = failed.pop();
-    failed.iter().for_each(|error| eprintln!("error: {error}"));
-    last.map_or(Ok(()), Err)
-}
-
-/// Refuses an output that exists already.
-fn refuse_existing(path: &Path) -> Result<()> {
-    match path.exists() {
-        true => Err(Error::Usage(format!("{}: exists already and is not overwritten; name a new one", path.display()))),
-        false => Ok(()),
-    }
-}
-
-/// Makes the new folder `path`, and those it lies in.
-fn new_folder(path: &Path) -> Result<()> {
-    refuse_existing(path)?;
-    std::fs::create_dir_all(path).map_err(Error::io(path))
-}
-
-/// Prints a line to `out`, as [`println`] does.
-fn print_line(mut out: impl Write + IsTerminal + terminal::Columns, text: &str) {
-    let text = terminal::fitted(&escaped_lines(text), &out);
-    // A stream that is closed takes no complaint either.
-    let _ = writeln!(out, "{text}");
-}
-
-/// Prints `text`. Whoever reads may stop before the end, as `head` does.
-fn print(text: &str) -> Result<()> {
-    let stdout = std::io::stdout();
-    let text = terminal::fitted(&escaped_lines(text), &stdout);
-    match stdout.lock().write_all(text.as_bytes()) {
-        Err(e) if e.kind() != io::ErrorKind::BrokenPipe => Err(Error::io("standard output")(e)),
-        _ => Ok(()),
-    }
-}
-
-/// Prints one JSON value as the last line.
-fn print_json(value: &impl Serialize) -> Result<()> {
-    let text = serde_json::to_string(value).map_err(|e| Error::Fault(format!("cannot be written as JSON: {e}")))?;
-    match std::io::stdout().lock().write_all((escaped_json(&text) + "\n").as_bytes()) {
-        Err(e) if e.kind() != io::ErrorKind::BrokenPipe => Err(Error::io("standard output")(e)),
-        _ => Ok(()),
-    }
-}
-
-/// A number with `decimals`, or a dash where there is none.
-fn or_dash(value: Option<f64>, decimals: usize) -> String {
-    value.map_or("-".into(), |value| format!("{value:.decimals$}"))
 }

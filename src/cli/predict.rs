@@ -5,7 +5,9 @@ use std::path::PathBuf;
 use clap::Args;
 use serde::Serialize;
 
-use super::{end_with, load_pilot, print, print_json};
+use super::arguments::load_pilot;
+use super::process::end_with;
+use super::terminal::{print, print_json};
 use crate::error::{Error, Result};
 use crate::evaluation::far_steering_notice;
 use crate::pilot::Answer;

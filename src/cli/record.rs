@@ -4,8 +4,9 @@ use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
 
-use super::share_bar::ShareBar;
-use super::{camera_preset, pool, print_json, stop_on_ctrl_c};
+use super::arguments::camera_preset;
+use super::process::{pool, stop_on_ctrl_c};
+use super::terminal::{ShareBar, print_json};
 use crate::error::Result;
 use crate::live::{DEFAULT_PORT, ManualDrive, Shares};
 use crate::simulator::car::expert::Style;

@@ -4,7 +4,8 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use super::{print, print_json, refuse_existing};
+use super::arguments::refuse_existing;
+use super::terminal::{print, print_json};
 use crate::error::Result;
 use crate::files::atomic_file;
 use crate::report::pages::run_list;

@@ -8,9 +8,9 @@ use std::time::{Duration, Instant};
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::throttle::Throttle;
-use super::words::counted;
-use super::{load_pilot, or_dash, print_json, stop_on_ctrl_c};
+use super::arguments::{Throttle, load_pilot};
+use super::process::stop_on_ctrl_c;
+use super::terminal::{counted, or_dash, print_json};
 use crate::error::{Error, Result};
 use crate::live::{self, CoDriverPage};
 use crate::observer::Observer;

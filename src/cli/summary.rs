@@ -6,8 +6,8 @@ use clap::Args;
 use serde::Serialize;
 use steersman_kernels::Isa;
 
-use super::words::counted;
-use super::{RecipeArgs, load_model, or_dash, print, print_json, refuse_existing};
+use super::arguments::{RecipeArgs, load_model, refuse_existing};
+use super::terminal::{counted, or_dash, print, print_json};
 use crate::engine::network::{NamedLayer, Network};
 use crate::error::Result;
 use crate::files::atomic_file;

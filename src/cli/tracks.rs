@@ -9,8 +9,8 @@ use clap::Args;
 use image::{ImageFormat, RgbImage};
 use serde::Serialize;
 
-use super::recording_args::RecordingArgs;
-use super::{print, print_json};
+use super::arguments::RecordingArgs;
+use super::terminal::{print, print_json};
 use crate::dataset::{Recording, View};
 use crate::error::{Error, Result};
 use crate::files::new_folder::NewFolder;

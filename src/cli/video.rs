@@ -5,9 +5,9 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use serde::Serialize;
 
-use super::recording_args::RecordingArgs;
-use super::share_bar::ShareBar;
-use super::{load_pilot, print_json, stop_on_ctrl_c};
+use super::arguments::{RecordingArgs, load_pilot};
+use super::process::stop_on_ctrl_c;
+use super::terminal::{ShareBar, print_json};
 use crate::error::{Error, Result};
 use crate::report::video::onlooker::Onlooker;
 use crate::report::video::recording;

@@ -5,7 +5,8 @@ use std::sync::Arc;
 
 use clap::Parser;
 
-use super::{Cli, Command, drive, pool, stop_on_ctrl_c};
+use super::process::{pool, stop_on_ctrl_c};
+use super::{Cli, Command, drive};
 use crate::cluster::{Order, Team, await_order};
 use crate::error::{Error, Result};
 use crate::training;

@@ -12,7 +12,7 @@ use pyo3::types::{PyDict, PyList};
 use super::arrays::{plain, said};
 use super::model::Model;
 use super::work;
-use crate::cli::throttle::Throttle;
+use crate::cli::arguments::Throttle;
 use crate::error::{Error, Result};
 use crate::evaluation::{self, EvaluateRequest, EvaluationEvent};
 use crate::files::new_folder::NewFolder;

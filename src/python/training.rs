@@ -8,7 +8,7 @@ use pyo3::types::PyDict;
 
 use super::arrays::{plain, said};
 use super::work::{self, Reporter};
-use crate::cli::model_arg::model_file;
+use crate::cli::arguments::model_file;
 use crate::dataset::held_out::{self, trained_on_held_out};
 use crate::error::{Error, Result};
 use crate::main_job::job::RECORDINGS;

@@ -4,8 +4,7 @@ use serde::{Deserialize, Serialize};
 use steersman_kernels::Backend;
 use steersman_kernels::conv::{Conv, ConvShape};
 
-use super::export_form::weight_and_bias;
-use super::kind::{MAX_NUMBERS, check_first_value, check_sizes, pair};
+use super::kind::{MAX_NUMBERS, check_first_value, check_sizes, pair, weight_and_bias};
 use super::{
     ExportForm, Family, Grads, Layer, LayerKind, Linear, Packing, Pads, Pair, ParamSpec, Pass, ReceptiveField,
 };

@@ -5,8 +5,7 @@ use steersman_kernels::gemm::{gemm, gemm_scratch_len};
 use steersman_kernels::matrix::{Matrix, MatrixMut};
 use steersman_kernels::{Backend, Isa};
 
-use super::export_form::weight_and_bias;
-use super::kind::{MAX_NUMBERS, check_first_value, check_sizes};
+use super::kind::{MAX_NUMBERS, check_first_value, check_sizes, weight_and_bias};
 use super::{ExportForm, Family, Grads, Layer, LayerKind, Linear, Pair, ParamSpec, Pass, ReceptiveField};
 use crate::engine::tensor::{Fans, Initializer, Shape};
 

@@ -1,4 +1,5 @@
-//! The layers: forward pass and hand-written backward pass of each, one file a kind.
+//! The layers: forward pass and hand-written backward pass of each, one file a kind; families of several kinds have a folder each. What
+//! the program asks a kind of layer lies in `kind/`.
 //!
 //! A [`Layer`] is a description: sizes and options, no state. Parameters, activations and gradients live in buffers that
 //! [`network`](crate::engine::network) plans once, so a training step allocates nothing and threads share a network without a
@@ -17,9 +18,9 @@
 //! 1. **Kernel and reference**, if the layer computes something new: a fast loop in `kernels/src/` (as in `activation.rs`), and a
 //!    naive one in double precision in `kernels/src/reference.rs`.
 //! 2. **Kernel test**: the two loops against each other in `kernels/tests/against_reference/` (as in `elementwise.rs`).
-//! 3. **Layer**: a file in this folder, with its `mod` and `pub use` lines. It holds the layer, which implements [`Layer`]; its
-//!    options, which implement [`LayerKind`]: name, family, receptive field, checks, export form; and gradient checks with
-//!    [`gradcheck::check_layer`] (odd sizes, batch 1). Spoil a gradient on purpose and see the check fail.
+//! 3. **Layer**: a file in this folder or in that of its family, with its `mod` and `pub use` lines. It holds the layer, which
+//!    implements [`Layer`]; its options, which implement [`LayerKind`]: name, family, receptive field, checks, export form; and
+//!    gradient checks with [`gradcheck::check_layer`] (odd sizes, batch 1). Spoil a gradient on purpose and see the check fail.
 //! 4. **Spec entry**: one line in `network/spec.rs`, the `kind` of recipes with an example.
 //! 5. **Documentation**: the `layers` entry in `data/README.md`, and CHANGELOG.
 //! 6. **Keras reader**, if Keras has the layer: an arm in `exchange/keras/translate.rs`.
@@ -34,21 +35,14 @@
 
 mod activation;
 mod batch_norm;
-mod blur;
 mod conv2d;
-mod crop;
 mod dense;
 mod dropout;
-mod export_form;
-mod flatten;
-mod formula;
 pub mod gradcheck;
 mod kind;
-mod kind_check;
-mod pool;
-mod resize;
+mod pooling;
+mod rearrangement;
 mod scale;
-mod zero_pad;
 
 use std::fmt::Debug;
 
@@ -58,20 +52,15 @@ pub use activation::{
 };
 pub(crate) use batch_norm::Moments;
 pub use batch_norm::{BatchNorm, BatchNormSpec};
-pub use blur::{Blur, BlurSpec};
 pub use conv2d::{Conv2d, Conv2dSpec, Padding};
-pub use crop::{Crop, CropSpec};
 pub use dense::{Dense, DenseSpec};
 pub use dropout::{Dropout, DropoutSpec};
-pub use export_form::{ExportForm, Pads};
-pub use flatten::{Flatten, FlattenSpec};
-pub use formula::{Formula, Function};
-pub use kind::{Family, LayerKind, ReceptiveField};
-pub use kind_check::check_kind;
-pub use pool::{AveragePool, AveragePoolSpec, MaxPool, MaxPoolSpec};
-pub use resize::{Resize, ResizeMethod, ResizeSpec, Taps};
+pub use kind::{ExportForm, Family, Formula, Function, LayerKind, Pads, ReceptiveField, check_kind};
+pub use pooling::{
+    AveragePool, AveragePoolSpec, Blur, BlurSpec, MaxPool, MaxPoolSpec, Resize, ResizeMethod, ResizeSpec, Taps,
+};
+pub use rearrangement::{Crop, CropSpec, Flatten, FlattenSpec, ZeroPad, ZeroPadSpec};
 pub use scale::{Scale, ScaleSpec};
-pub use zero_pad::{ZeroPad, ZeroPadSpec};
 
 use crate::engine::tensor::{Fans, Initializer, Shape};
 
