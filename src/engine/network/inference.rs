@@ -6,7 +6,6 @@ use ndarray::{Array2, ArrayView4, ArrayViewMut1};
 use rayon::prelude::*;
 
 use super::fused::{FusedStage, Kind, stages};
-use super::step_input::image_slice;
 use super::{Network, Parameters};
 use crate::engine::layers::{Family, Packing};
 use crate::engine::stopwatch::Stopwatch;
@@ -114,7 +113,7 @@ impl InferencePlan {
         mut y: ArrayViewMut1<f32>,
     ) {
         let (input, output) = (network.input().len(), network.output().len());
-        let x = image_slice(network, x);
+        let x = network.image_slice(x);
         let n = x.len() / input;
         assert!(n <= self.capacity, "a batch of {n} images in a plan for {}", self.capacity);
         let y = y.as_slice_mut().expect("predictions must be contiguous");

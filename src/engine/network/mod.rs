@@ -15,27 +15,16 @@
 mod fused;
 mod inference;
 mod observation;
-mod passes;
 mod predictor;
-mod ranks;
-mod reduction;
-mod shard;
-mod shard_tree;
 mod spec;
-mod step_input;
-mod step_profile;
 mod structure;
 mod training;
 
 pub use inference::InferencePlan;
 pub use observation::ObservationPlan;
 pub use predictor::Predictor;
-pub use ranks::Ranks;
-pub use shard_tree::share;
 pub use spec::LayerSpec;
-pub use step_input::StepInput;
-pub use step_profile::StageTime;
 pub use structure::{MAX_PARAMETERS, NamedLayer, Network, group_digits};
-pub use training::TrainingPlan;
+pub use training::{Ranks, StageTime, StepInput, TrainingPlan, share};
 
 pub use crate::engine::parameters::{Parameters, Tensor};

@@ -4,6 +4,7 @@ use std::fmt::Write as _;
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::ops::Range;
 
+use ndarray::{ArrayView4, Axis};
 use steersman_kernels::{Backend, Isa};
 
 use super::LayerSpec;
@@ -112,6 +113,17 @@ impl Network {
             (format!("{:?}", layer.spec), &layer.params, &layer.statistics, layer.frozen).hash(&mut hasher);
         }
         hasher.finish()
+    }
+
+    /// The images `x`, `(n, c, h, w)`, as a slice.
+    ///
+    /// # Panics
+    ///
+    /// Panics if they are not of the network's input shape, or not contiguous in standard order.
+    pub(super) fn image_slice<'a>(&self, x: ArrayView4<'a, f32>) -> &'a [f32] {
+        let n = x.len_of(Axis(0));
+        assert_eq!(x.dim(), self.input().batch(n), "images (n, c, h, w) of another shape than the network's input");
+        x.to_slice().expect("images must be contiguous in standard order")
     }
 
     /// Panics if `parameters` have other lengths than those of this network.

@@ -1,7 +1,7 @@
 //! Where the time of training steps goes, stage by stage.
 
-use super::Network;
-use super::fused::FusedStage;
+use crate::engine::network::Network;
+use crate::engine::network::fused::FusedStage;
 use crate::engine::stopwatch::Stopwatch;
 
 /// The stopwatches of a plan; off until [`measure`](super::TrainingPlan::measure).

@@ -2,13 +2,13 @@
 
 use std::ops::Range;
 
-use super::fused::{FusedStage, Kind, replaces_input};
 use super::shard::Shard;
 use super::step_input::StepSlices;
 use super::step_profile::StepTimes;
-use super::{Network, Parameters};
 use crate::engine::layers::{BatchStatistics, Grads, Pair, Pass};
 use crate::engine::loss::Loss;
+use crate::engine::network::fused::{FusedStage, Kind, replaces_input};
+use crate::engine::network::{Network, Parameters};
 
 /// The stages of a network, and what they need in every step.
 #[derive(Debug)]

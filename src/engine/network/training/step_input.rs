@@ -4,8 +4,8 @@ use std::ops::Range;
 
 use ndarray::{ArrayView1, ArrayView4};
 
-use super::Network;
 use crate::engine::loss::PairTerms;
+use crate::engine::network::Network;
 
 /// The batch of one training step.
 ///
@@ -57,20 +57,9 @@ impl<'a> StepInput<'a> {
     ///
     /// Panics if a shape does not fit or an array is not contiguous in standard order.
     pub(super) fn slices(&self, network: &Network) -> StepSlices<'a> {
-        let (x, n) = (image_slice(network, self.x), self.x.len_of(ndarray::Axis(0)));
+        let (x, n) = (network.image_slice(self.x), self.x.len_of(ndarray::Axis(0)));
         let labels = self.labels.to_slice().expect("labels must be contiguous");
         assert_eq!(labels.len(), n * network.output().len(), "labels for a batch of {n} images");
         StepSlices { x, labels, seed: self.seed, step: self.step, pairs: PairTerms::default(), first: 0, of: n }
     }
-}
-
-/// The images `x`, `(n, c, h, w)`, as a slice.
-///
-/// # Panics
-///
-/// Panics if they are not of the network's input shape, or not contiguous in standard order.
-pub(super) fn image_slice<'a>(network: &Network, x: ArrayView4<'a, f32>) -> &'a [f32] {
-    let n = x.len_of(ndarray::Axis(0));
-    assert_eq!(x.dim(), network.input().batch(n), "images (n, c, h, w) of another shape than the network's input");
-    x.to_slice().expect("images must be contiguous in standard order")
 }

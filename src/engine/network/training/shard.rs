@@ -5,7 +5,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use steersman_kernels::{Isa, update};
 
-use super::Network;
+use crate::engine::network::Network;
 
 /// A part of the batch with a gradient of its own, worked on by one thread at a time.
 #[derive(Debug)]
