@@ -5,7 +5,6 @@ mod balance;
 mod labels;
 pub mod leak;
 pub mod loader;
-mod noise;
 mod outputs;
 mod pairs;
 mod spec;

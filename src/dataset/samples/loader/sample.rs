@@ -1,9 +1,26 @@
 //! Making a sample: decoding its picture, warping it to where a car is shown to stand, changing it, and the label that belongs to it.
 
-use super::*;
+use super::{Loader, cached_len, keeps_rgb, lock};
+use crate::Result;
+use crate::dataset::pictures::preprocess::{Preprocessing, Preprocessor};
+use crate::dataset::recording::View;
 use crate::dataset::samples::labels::{chained, turn_of_camera};
-use crate::dataset::samples::{Correction, Mirror};
+use crate::dataset::samples::pairs::Wanted;
+use crate::dataset::samples::{Correction, Item, Mirror};
+use crate::engine::random::{Purpose, rng};
 use crate::geometry::{CarGeometry, Offset, PixelGrid, ViewWarp};
+use crate::picture::{RgbImage, decode::decode_rgb};
+
+/// Buffers of one thread.
+#[derive(Debug)]
+pub(super) struct Scratch {
+    file: Vec<u8>,
+    image: RgbImage,
+    preprocessor: Preprocessor,
+    cached: Vec<u8>,
+    rgb: Vec<u8>,
+    planes: Vec<u8>,
+}
 
 impl Loader {
     /// Writes a sample's network input to `x` and its labels to `labels`; `false` if the image cannot be decoded.
@@ -158,7 +175,12 @@ impl Loader {
     }
 
     /// Reads and decodes an image.
-    fn read(&self, image: u32, file: &mut Vec<u8>, decoded: &mut RgbImage) -> std::result::Result<(), String> {
+    pub(super) fn read(
+        &self,
+        image: u32,
+        file: &mut Vec<u8>,
+        decoded: &mut RgbImage,
+    ) -> std::result::Result<(), String> {
         let (item, camera) = self.images[image as usize];
         let Item { recording, row, .. } = self.items[item as usize];
         let recording = &self.recordings[usize::from(recording)];
@@ -167,35 +189,29 @@ impl Loader {
         decode_rgb(file, decoded).map_err(|message| format!("{}: {message}", path.display()))
     }
 
-    /// Whether the audit of near twins looks at the row of this image.
-    fn is_compared(&self, image: u32) -> bool {
-        (self.images[image as usize].0 as usize).is_multiple_of(compared_every(self.items.len()))
+    fn report(&self, image: u32, message: String) {
+        lock(&self.undecodable).insert(image, message);
     }
 
-    fn thumbnail(&self, decoded: &RgbImage) -> Thumbnail {
-        let Preprocessing { rows, source, .. } = self.spec.preprocessing;
-        Thumbnail::of(decoded, rows, source[0])
-    }
-
-    /// Looks at the centre pictures of rows of which only other pictures were shown: a view from beside the path is made of the nearest
-    /// camera's.
-    pub(super) fn look_at_centres(&self) {
-        let known = |image: u32| self.thumbnails[self.pictures[image as usize] as usize].get().is_some();
-        (0..self.items.len()).into_par_iter().for_each_init(
-            Default::default,
-            |(file, decoded): &mut (_, RgbImage), item| {
-                let images = self.first_images[item]..self.first_images[item + 1];
-                let centre = images.clone().find(|&image| self.images[image as usize].1 == View::Centre);
-                let Some(centre) =
-                    centre.filter(|&centre| self.is_compared(centre) && !known(centre) && images.clone().any(known))
-                else {
-                    return;
-                };
-                // Pictures that cannot be read are told where they are trained on.
-                if self.read(centre, file, decoded).is_ok() {
-                    let _ = self.thumbnails[self.pictures[centre as usize] as usize].set(Some(self.thumbnail(decoded)));
+    /// Runs `work` with buffers that no other thread uses.
+    pub(super) fn with_scratch<T>(&self, work: impl FnOnce(&mut Scratch) -> T) -> Result<T> {
+        let held = lock(&self.scratch).pop();
+        let mut scratch = match held {
+            Some(scratch) => scratch,
+            None => {
+                let spec = &self.spec.preprocessing;
+                Scratch {
+                    file: Vec::new(),
+                    image: RgbImage::default(),
+                    preprocessor: spec.plan(spec.source[0], spec.source[1])?,
+                    cached: vec![0; cached_len(&self.spec, self.training, self.flip)],
+                    rgb: vec![0; spec.rgb_len()],
+                    planes: vec![0; spec.output_len()],
                 }
-            },
-        );
+            }
+        };
+        let result = work(&mut scratch);
+        lock(&self.scratch).push(scratch);
+        Ok(result)
     }
 }

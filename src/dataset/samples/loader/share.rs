@@ -1,6 +1,9 @@
-//! Batches of which this process has but a share, and what the processes tell each other of their pictures.
+//! Batches of which this process has but a share, and what the processes tell each other of pictures that cannot be decoded.
 
-use super::*;
+use super::{Batch, Loader, ShareOf, lock};
+use crate::Result;
+use rayon::prelude::*;
+use std::ops::Range;
 
 /// What a rank could not decode.
 #[derive(Debug, serde::Serialize, serde::Deserialize)]
@@ -73,32 +76,5 @@ impl Loader {
             wanted.decoded = self.with_scratch(|scratch| self.make_sample(wanted, x, labels, scratch))??;
             Ok(())
         })
-    }
-
-    /// What the audit of near twins knows of the pictures that were decoded so far, for [`take_thumbnails`](Loader::take_thumbnails).
-    pub fn thumbnails(&self) -> Vec<u8> {
-        let known =
-            self.thumbnails.iter().enumerate().filter_map(|(picture, thumbnail)| Some((picture, thumbnail.get()?)));
-        let mut bytes = Vec::new();
-        for (picture, thumbnail) in known {
-            bytes.extend((picture as u32).to_le_bytes());
-            bytes.push(u8::from(thumbnail.is_some()));
-            bytes.extend(thumbnail.iter().flat_map(|thumbnail| thumbnail.cells()));
-        }
-        bytes
-    }
-
-    /// Takes over what another process knows of the same pictures.
-    pub fn take_thumbnails(&self, mut bytes: &[u8]) {
-        while let Some((head, rest)) = bytes.split_at_checked(5) {
-            let picture = u32::from_le_bytes([head[0], head[1], head[2], head[3]]) as usize;
-            let len = if head[4] == 0 { 0 } else { Thumbnail::LEN };
-            let Some((cells, rest)) = rest.split_at_checked(len) else { return };
-            bytes = rest;
-            let thumbnail = Thumbnail::of_cells(cells);
-            if let Some(known) = self.thumbnails.get(picture) {
-                known.get_or_init(|| thumbnail);
-            }
-        }
     }
 }

@@ -5,27 +5,29 @@
 //! threads, cache or order of calls.
 
 use super::augment::Augmentation;
-use super::leak::{NearTwins, Thumbnail, compared_every};
-use super::pairs::{Pairing, Wanted};
+use super::leak::{Thumbnail, compared_every};
+use super::pairs::Pairing;
 use super::split::Split;
 use super::{Flip, Group, Item, Mirror, SampleSpec, Targets};
 use crate::dataset::pictures::cache::{CacheSpec, ImageCache};
-use crate::dataset::pictures::preprocess::{Preprocessing, Preprocessor};
+use crate::dataset::pictures::preprocess::Preprocessing;
 use crate::dataset::recording::{Recording, View};
-use crate::engine::loss::{Pairs, Smoothness};
+use crate::engine::loss::Smoothness;
 use crate::engine::random::{Purpose, rng, shuffle, unit};
 use crate::engine::stopwatch::Stopwatch;
-use crate::picture::{RgbImage, decode::decode_rgb};
 use crate::{Error, Result};
-use rayon::prelude::*;
 use std::collections::BTreeMap;
-use std::ops::Range;
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 
+mod audit;
+mod batch;
 mod sample;
 mod share;
 
+pub use batch::{Batch, SampleId, ShareOf};
 pub use share::Losses;
+
+use sample::Scratch;
 
 /// Everything that decides what batches look like.
 #[derive(Debug, Clone, PartialEq)]
@@ -43,42 +45,6 @@ pub struct LoaderSpec {
     /// How much is kept, and where.
     pub cache: CacheSpec,
 }
-
-/// Which image a sample shows.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct SampleId {
-    /// Which recording.
-    pub recording: u16,
-    /// Which row of it.
-    pub row: u32,
-    /// Which camera.
-    pub camera: View,
-    /// Whether the image is mirrored, and the label negated.
-    pub mirrored: bool,
-}
-
-/// Samples for one step. The buffers are reused from batch to batch.
-#[derive(Debug, Clone, Default)]
-pub struct Batch {
-    /// Network input, `[share][c][h][w]`.
-    pub x: Vec<f32>,
-    /// Labels, `[share][outputs]`: steering with the corrections of camera and shift, + = right, not clamped; then the others of the row,
-    /// as they are.
-    pub labels: Vec<f32>,
-    /// Which of its samples `x` and `labels` hold: all, unless other processes have a share of the batch.
-    pub share: Range<usize>,
-    /// Number of samples; less than asked for at the end of an epoch, and where images cannot be decoded.
-    pub n: usize,
-    /// Where each sample comes from, `[n]`.
-    pub samples: Vec<SampleId>,
-    /// The pairs among its first samples.
-    pub pairs: Pairs,
-    /// What it is to hold; kept to be used again.
-    work: Vec<Wanted>,
-}
-
-/// Which of so many samples are those of this process, if there are pairs among them or not.
-pub type ShareOf<'a> = &'a dyn Fn(usize, bool) -> Range<usize>;
 
 /// Makes the batches of one side of a split.
 #[derive(Debug)]
@@ -107,6 +73,8 @@ pub struct Loader {
     pairing: Option<Pairing>,
     epoch: u64,
     cache: ImageCache,
+    /// One row in how many the audit of near twins looks at.
+    compared_every: usize,
     /// Of each picture that was decoded: what the audit compares, if it is the centre camera's.
     thumbnails: Vec<OnceLock<Option<Thumbnail>>>,
     undecodable: Mutex<BTreeMap<u32, String>>,
@@ -140,17 +108,6 @@ pub struct LoaderTimes {
     pub preprocess: Stopwatch,
     /// Random changes.
     pub augment: Stopwatch,
-}
-
-/// Buffers of one thread.
-#[derive(Debug)]
-struct Scratch {
-    file: Vec<u8>,
-    image: RgbImage,
-    preprocessor: Preprocessor,
-    cached: Vec<u8>,
-    rgb: Vec<u8>,
-    planes: Vec<u8>,
 }
 
 impl Loader {
@@ -249,6 +206,7 @@ impl Loader {
             training,
             flip,
             cache: ImageCache::new(all.pictures, cached_len(spec, training, flip), &spec.cache)?,
+            compared_every: compared_every(items.len()),
             thumbnails: (0..all.pictures).map(|_| OnceLock::new()).collect(),
             items,
             images,
@@ -353,53 +311,6 @@ impl Loader {
         }
     }
 
-    /// Fills `out` with batch number `batch` of the epoch. Allocates nothing once all images are cached and `out` has
-    /// held a full batch.
-    ///
-    /// # Errors
-    /// If the cache file fails. An image that cannot be decoded is no error: it is left out and counted.
-    ///
-    /// # Panics
-    /// If there is no such batch.
-    pub fn fill(&self, batch: usize, out: &mut Batch) -> Result<()> {
-        let whole = |n: usize, _: bool| 0..n;
-        let complete = self.fill_share(batch, out, &whole)?;
-        self.settle(out, complete, &whole);
-        Ok(())
-    }
-
-    /// The first half of [`fill`](Loader::fill), where this process has but a share of the batch: `share` says which of so many samples,
-    /// with pairs among them or not. Answers whether all samples of the share could be decoded. [`settle`](Loader::settle) must follow.
-    ///
-    /// # Errors
-    /// As [`fill`](Loader::fill).
-    ///
-    /// # Panics
-    /// As [`fill`](Loader::fill).
-    pub fn fill_share(&self, batch: usize, out: &mut Batch, share: ShareOf) -> Result<bool> {
-        let per_batch = self.per_batch();
-        let taken = &self.order[batch * per_batch..self.order.len().min((batch + 1) * per_batch)];
-        let variants = self.variants() as u32;
-        out.work.clear();
-        out.pairs = Pairs::default();
-        match (self.spec.samples.group, &self.pairing) {
-            (Group::Images, None) => out.work.extend(taken.iter().map(|&sample| Wanted::single(sample))),
-            (Group::Images, Some(pairing)) => out.pairs = pairing.lay_out(taken, variants, &mut out.work),
-            (Group::Rows, _) => {
-                for &item in taken {
-                    let images = self.first_images[item as usize]..self.first_images[item as usize + 1];
-                    out.work.extend((images.start * variants..images.end * variants).map(Wanted::single));
-                }
-            }
-        }
-        out.n = out.work.len();
-        // Those of the others count as decoded until `settle` knows better.
-        out.work.iter_mut().for_each(|wanted| wanted.decoded = true);
-        out.share = share(out.n, out.pairs.images() > 0);
-        self.make_samples(out)?;
-        Ok(out.work[out.share.clone()].iter().all(|wanted| wanted.decoded))
-    }
-
     /// Images that could not be decoded so far: their number, and the first few with their paths.
     pub fn undecodable(&self) -> (usize, Vec<String>) {
         let undecodable = lock(&self.undecodable);
@@ -419,18 +330,6 @@ impl Loader {
         let undecodable = lock(&self.undecodable);
         let lost = self.pictures[..self.own.images].iter().filter(|picture| undecodable.contains_key(picture)).count();
         self.samples() - lost * self.variants()
-    }
-
-    /// How many frames of this (validation) loader have a near twin in `training`. Frames are known once they, or those of the other
-    /// cameras beside them, were shown, so this is to be asked after the first epoch.
-    pub fn near_twins(&self, training: &Loader) -> NearTwins {
-        training.look_at_centres();
-        let one_row_in = [self, training].map(|side| compared_every(side.items.len()));
-        NearTwins::count(&self.thumbnails_kept(), &training.thumbnails_kept(), one_row_in)
-    }
-
-    fn thumbnails_kept(&self) -> Vec<&Thumbnail> {
-        self.thumbnails.iter().filter_map(OnceLock::get).flatten().collect()
     }
 
     fn variants(&self) -> usize {
@@ -456,64 +355,6 @@ impl Loader {
             Flip::Random => unit(&mut rng(self.spec.seed, Purpose::Mirror, self.epoch, u64::from(sample))) < 0.5,
         }
     }
-
-    fn report(&self, image: u32, message: String) {
-        lock(&self.undecodable).insert(image, message);
-    }
-
-    /// Moves samples up to where others could not be decoded, and notes where the rest come from. A pair goes as a whole.
-    fn close_gaps(&self, out: &mut Batch) {
-        let (len, outputs) = (self.spec.preprocessing.output_len(), self.targets.outputs());
-        let mut n = 0;
-        out.samples.clear();
-        let whole = out.share == (0..out.n);
-        let pairs = out.pairs;
-        for i in 0..out.n {
-            let Wanted { sample, draws, decoded, .. } = out.work[i];
-            let is_paired = i < pairs.images();
-            if !decoded || (is_paired && !out.work[i ^ 1].decoded) {
-                let of_kind = if i < 2 * pairs.spatial { &mut out.pairs.spatial } else { &mut out.pairs.temporal };
-                *of_kind -= usize::from(is_paired && i % 2 == 0);
-                continue;
-            }
-            if n < i {
-                out.x.copy_within(i * len..(i + 1) * len, n * len);
-                out.labels.copy_within(i * outputs..(i + 1) * outputs, n * outputs);
-            }
-            let (item, camera) = self.images[sample as usize / self.variants()];
-            let Item { recording, row, .. } = self.items[item as usize];
-            out.samples.push(SampleId { recording, row, camera, mirrored: self.is_mirrored(draws) });
-            n += 1;
-        }
-        out.n = n;
-        if whole {
-            out.share = 0..n;
-            out.x.truncate(n * len);
-            out.labels.truncate(n * outputs);
-        }
-    }
-
-    /// Runs `work` with buffers that no other thread uses.
-    fn with_scratch<T>(&self, work: impl FnOnce(&mut Scratch) -> T) -> Result<T> {
-        let held = lock(&self.scratch).pop();
-        let mut scratch = match held {
-            Some(scratch) => scratch,
-            None => {
-                let spec = &self.spec.preprocessing;
-                Scratch {
-                    file: Vec::new(),
-                    image: RgbImage::default(),
-                    preprocessor: spec.plan(spec.source[0], spec.source[1])?,
-                    cached: vec![0; cached_len(&self.spec, self.training, self.flip)],
-                    rgb: vec![0; spec.rgb_len()],
-                    planes: vec![0; spec.output_len()],
-                }
-            }
-        };
-        let result = work(&mut scratch);
-        lock(&self.scratch).push(scratch);
-        Ok(result)
-    }
 }
 
 /// Whether images are cached at the RGB stage, because they are augmented in each epoch or mirrored with geometry.
@@ -537,5 +378,4 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 #[cfg(test)]
-#[path = "loader_tests.rs"]
 mod tests;
