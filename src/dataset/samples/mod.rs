@@ -2,6 +2,7 @@
 
 pub mod augment;
 mod balance;
+mod label_spec;
 mod labels;
 pub mod leak;
 pub mod loader;
@@ -13,6 +14,7 @@ pub mod takeover;
 pub mod whole;
 
 pub use balance::Balance;
-pub use labels::{EXPERT_AHEAD_M, LabelKind, LabelSpec, Targets};
+pub use label_spec::{EXPERT_AHEAD_M, LabelKind, LabelSpec};
+pub use labels::Targets;
 pub use outputs::{OutputKind, OutputSpec, Outputs};
 pub use spec::{Correction, Flip, Group, Item, Mirror, SampleSpec};

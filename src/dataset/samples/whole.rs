@@ -2,13 +2,15 @@
 
 use std::collections::HashSet;
 
-use super::split::{Split, SplitMode, SplitSpec, all_rows, drop_low_throttle, drop_unlabelled, set_cameras};
+use super::split::{
+    Split, SplitMode, SplitSpec, all_rows, drop_low_throttle, drop_unlabelled, refuse_too_many, set_cameras,
+};
 use super::{Balance, Item, SampleSpec, Targets};
 use crate::dataset::recording::Recording;
 use crate::{Error, Result};
 
-/// Puts the recordings, whose labels are `targets`, from number `first` on, whole, on the validation side, and those before on the training side. Rows of the
-/// training side whose picture stands on the validation side too are left out.
+/// Puts the recordings, whose labels are `targets`, from number `first` on, whole, on the validation side, and those before on the
+/// training side. Rows of the training side whose picture stands on the validation side too are left out.
 ///
 /// # Errors
 ///
@@ -23,9 +25,7 @@ pub fn split_whole(
 ) -> Result<Split> {
     samples.validate()?;
     balance.validate()?;
-    if recordings.len() > usize::from(u16::MAX) {
-        return Err(Error::Usage("more than 65,535 recordings".into()));
-    }
+    refuse_too_many(recordings)?;
     let (mut validation, mut training): (Vec<Item>, Vec<Item>) =
         all_rows(recordings).into_iter().partition(|item| usize::from(item.recording) >= first);
     let picture = |item: &Item| recordings[usize::from(item.recording)].picture_hash(item.row as usize);

@@ -121,9 +121,7 @@ pub fn split(
     spec.validate()?;
     samples.validate()?;
     balance.validate()?;
-    if recordings.len() > usize::from(u16::MAX) {
-        return Err(Error::Usage("more than 65,535 recordings".into()));
-    }
+    refuse_too_many(recordings)?;
     let mut split = Split {
         spec: spec.clone(),
         whole: false,
@@ -212,11 +210,7 @@ impl Split {
     /// # Errors
     /// [`Error::Usage`] for too many recordings.
     pub fn train_on(&mut self, recordings: &[Recording], first: usize, targets: &Targets) -> Result<()> {
-        if recordings.len() > usize::from(u16::MAX) {
-            return Err(Error::Usage("more than 65,535 recordings".into()));
-        }
-        let mut views: Vec<Item> =
-            all_rows(recordings).into_iter().filter(|item| usize::from(item.recording) >= first).collect();
+        let mut views = rows_from(recordings, first)?;
         // Only a label beside the steering can be missing: a view has been given its steering.
         self.unlabelled_rows += drop_unlabelled(&mut views, targets);
         if !views.is_empty() {
@@ -244,11 +238,7 @@ impl Split {
         balance: &Balance,
         seed: u64,
     ) -> Result<()> {
-        if recordings.len() > usize::from(u16::MAX) {
-            return Err(Error::Usage("more than 65,535 recordings".into()));
-        }
-        let mut rows: Vec<Item> =
-            all_rows(recordings).into_iter().filter(|item| usize::from(item.recording) >= first).collect();
+        let mut rows = rows_from(recordings, first)?;
         drop_low_throttle(&mut rows, recordings, samples);
         drop_unlabelled(&mut rows, targets);
         balance.apply(&mut rows, targets, seed);
@@ -321,6 +311,20 @@ fn rows_of_images(mut images: Vec<Item>) -> Vec<Item> {
 
 fn rows_of(recording: u16, rows: Range<usize>) -> impl Iterator<Item = Item> {
     rows.map(move |row| Item::new(recording, row as u32, [View::Centre]))
+}
+
+/// Refuses more recordings than an [`Item`] can number.
+pub(super) fn refuse_too_many(recordings: &[Recording]) -> Result<()> {
+    match recordings.len() > usize::from(u16::MAX) {
+        true => Err(Error::Usage("more than 65,535 recordings".into())),
+        false => Ok(()),
+    }
+}
+
+/// All rows of `recordings` from number `first` on.
+fn rows_from(recordings: &[Recording], first: usize) -> Result<Vec<Item>> {
+    refuse_too_many(recordings)?;
+    Ok(all_rows(recordings).into_iter().filter(|item| usize::from(item.recording) >= first).collect())
 }
 
 pub(super) fn all_rows(recordings: &[Recording]) -> Vec<Item> {
