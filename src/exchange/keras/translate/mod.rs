@@ -1,97 +1,22 @@
 //! Translates each Keras layer by its options alone; `assemble` adds shapes and weights.
 
-use serde_json::{Map, Value};
+mod activation;
+mod options;
+mod step;
+
+use serde_json::Value;
+
+pub(super) use step::{AxisOrder, KerasStep, KernelLayout, Operation};
 
 use super::architecture::KerasLayer;
 use super::lambda::{self, LambdaAffine};
 use super::messages::shown;
 use crate::engine::layers::{
-    BatchNormSpec, Conv2dSpec, CropSpec, DropoutSpec, EluSpec, LeakyReluSpec, Padding, ReluSpec, ResizeMethod,
-    ResizeSpec, ScaleSpec, SoftsignSpec, SwishSpec, TanhSpec, ZeroPadSpec,
+    BatchNormSpec, Conv2dSpec, CropSpec, DropoutSpec, Padding, ResizeMethod, ResizeSpec, ScaleSpec, ZeroPadSpec,
 };
-use crate::engine::network::LayerSpec;
 use crate::engine::tensor::Initializer;
-
-/// Order of the axes of a feature map.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum AxisOrder {
-    /// Height, width, channels (`tf`).
-    ChannelsLast,
-    /// Channels, height, width (`th`).
-    ChannelsFirst,
-}
-
-/// Order of the axes of a convolution's kernel in the file.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum KernelLayout {
-    /// Height, width, inputs, outputs.
-    HeightWidthInOut,
-    /// Outputs, inputs, height, width: Keras 1 with `dim_ordering` `th`.
-    OutInHeightWidth,
-}
-
-/// The operation of a layer, without its activation.
-#[derive(Clone, Debug, PartialEq)]
-pub(super) enum Operation {
-    /// No operation.
-    Nothing,
-    /// The input; extents without the batch, if the file gives them.
-    Input,
-    /// A layer without weights that is the same for every shape.
-    Plain(LayerSpec),
-    Conv {
-        spec: Conv2dSpec,
-        kernel: KernelLayout,
-        bias: bool,
-    },
-    Dense {
-        units: usize,
-        bias: bool,
-    },
-    BatchNorm {
-        spec: BatchNormSpec,
-        axis: i64,
-        center: bool,
-        scale: bool,
-    },
-    PRelu,
-    Pool {
-        max: bool,
-        window: [usize; 2],
-        stride: [usize; 2],
-        same: bool,
-    },
-    GlobalPool {
-        max: bool,
-    },
-    /// A map of another height and width.
-    Resize(ResizeSpec),
-    Flatten,
-}
-
-impl Operation {
-    /// Whether the file has tensors for it.
-    pub fn has_weights(&self) -> bool {
-        matches!(
-            self,
-            Operation::Conv { .. } | Operation::Dense { .. } | Operation::BatchNorm { .. } | Operation::PRelu
-        )
-    }
-}
-
-/// A translated layer.
-#[derive(Clone, Debug, PartialEq)]
-pub(super) struct KerasStep {
-    pub operation: Operation,
-    /// What follows, without weights.
-    pub activation: Option<LayerSpec>,
-    /// Order of the axes, if the layer says.
-    pub order: Option<AxisOrder>,
-    /// Extents of the input without the batch, in the order of the file, if the layer says; 0 where they are open.
-    pub input: Option<Vec<usize>>,
-    /// A notice to the user about what the translation loses.
-    pub notice: Option<&'static str>,
-}
+use activation::pointwise;
+use options::Options;
 
 /// Translates `layer`; `known` is the function that the user gave for it.
 ///
@@ -246,27 +171,6 @@ fn without_counterpart(class: &str) -> &'static str {
     }
 }
 
-/// An activation that is a layer of its own, or is named by one.
-fn pointwise(class: &str, options: &Options) -> Result<Option<LayerSpec>, String> {
-    Ok(Some(match class {
-        "ELU" => EluSpec { alpha: options.number(&["alpha"], 1.0)? as f32 }.into(),
-        "LeakyReLU" => LeakyReluSpec { slope: options.number(&["negative_slope", "alpha"], 0.3)? as f32 }.into(),
-        "ReLU" => {
-            if options.0.get("max_value").is_some_and(|value| !value.is_null()) {
-                return Err("a rectifier with a ceiling has no counterpart".into());
-            }
-            if options.number(&["threshold"], 0.0)? != 0.0 {
-                return Err("a rectifier with a threshold has no counterpart".into());
-            }
-            match options.number(&["negative_slope"], 0.0)? {
-                0.0 => ReluSpec {}.into(),
-                slope => LeakyReluSpec { slope: slope as f32 }.into(),
-            }
-        }
-        _ => return Ok(None),
-    }))
-}
-
 fn conv(options: &Options) -> Result<Operation, String> {
     if options.pair(&["dilation_rate", "atrous_rate"])?.unwrap_or([1, 1]) != [1, 1] {
         return Err("a kernel with holes (dilation) has no counterpart".into());
@@ -295,155 +199,10 @@ fn pool(options: &Options, max: bool) -> Result<Operation, String> {
     Ok(Operation::Pool { max, window, stride, same: options.same_padding()? })
 }
 
-/// The options of a layer; each may have several names, of which the newest comes first.
-struct Options<'a>(&'a Map<String, Value>);
-
-impl<'a> Options<'a> {
-    /// The first of `names` that is there and not null.
-    fn find(&self, names: &[&'static str]) -> Option<(&'static str, &'a Value)> {
-        names.iter().find_map(|name| self.0.get(*name).filter(|value| !value.is_null()).map(|value| (*name, value)))
-    }
-
-    fn number(&self, names: &[&'static str], default: f64) -> Result<f64, String> {
-        let Some((name, value)) = self.find(names) else { return Ok(default) };
-        // Keras 3 writes some numbers as arrays: {"class_name": "__numpy__", "config": {"value": 0.3}}.
-        let value = value.pointer("/config/value").unwrap_or(value);
-        let number = value.as_f64().filter(|number| number.is_finite());
-        number.ok_or_else(|| format!("`{name}` must be a number, not {}", short(value)))
-    }
-
-    fn flag(&self, names: &[&'static str], default: bool) -> Result<bool, String> {
-        let Some((name, value)) = self.find(names) else { return Ok(default) };
-        value.as_bool().ok_or_else(|| format!("`{name}` must be true or false, not {}", short(value)))
-    }
-
-    fn size(&self, names: &[&'static str]) -> Result<usize, String> {
-        let (name, value) = self.find(names).ok_or_else(|| format!("has no `{}`", names[0]))?;
-        size(value).ok_or_else(|| format!("`{name}` must be a whole number, not {}", short(value)))
-    }
-
-    /// Height and width; one number stands for both.
-    fn pair(&self, names: &[&'static str]) -> Result<Option<[usize; 2]>, String> {
-        let Some((name, value)) = self.find(names) else { return Ok(None) };
-        pair(value).map(Some).ok_or_else(|| format!("`{name}` must be two whole numbers, not {}", short(value)))
-    }
-
-    /// [top, bottom] and [left, right]: one number, [height, width], [top, bottom, left, right] or two pairs.
-    fn border(&self, names: &[&'static str]) -> Result<[[usize; 2]; 2], String> {
-        let (name, value) = self.find(names).ok_or_else(|| format!("has no `{}`", names[0]))?;
-        let found = match value.as_array().map(Vec::as_slice) {
-            Some([top, bottom, left, right]) => {
-                let sizes = [top, bottom, left, right].map(size);
-                sizes.iter().all(Option::is_some).then(|| {
-                    let [top, bottom, left, right] = sizes.map(Option::unwrap_or_default);
-                    [[top, bottom], [left, right]]
-                })
-            }
-            Some([rows @ Value::Array(_), columns @ Value::Array(_)]) => {
-                pair(rows).and_then(|rows| pair(columns).map(|columns| [rows, columns]))
-            }
-            _ => pair(value).map(|[h, w]| [[h, h], [w, w]]),
-        };
-        found
-            .ok_or_else(|| format!("`{name}` must be whole numbers for top, bottom, left, right, not {}", short(value)))
-    }
-
-    fn same_padding(&self) -> Result<bool, String> {
-        match self.find(&["padding", "border_mode"]).map(|(_, value)| value.as_str()) {
-            None | Some(Some("valid")) => Ok(false),
-            Some(Some("same")) => Ok(true),
-            Some(other) => {
-                Err(format!("padding `{}` has no counterpart", shown(other.unwrap_or("of an unknown kind"))))
-            }
-        }
-    }
-
-    /// The one axis that is normalised; -1 is the last.
-    fn axis(&self) -> Result<i64, String> {
-        let axis = match self.find(&["axis"]).map(|(_, value)| value) {
-            None => Some(-1),
-            Some(Value::Array(axes)) => axes.first().filter(|_| axes.len() == 1).and_then(Value::as_i64),
-            Some(value) => value.as_i64(),
-        };
-        axis.ok_or_else(|| "normalising over several axes has no counterpart".to_string())
-    }
-
-    fn order(&self) -> Result<Option<AxisOrder>, String> {
-        match self.find(&["data_format", "dim_ordering"]).map(|(_, value)| value.as_str()) {
-            None | Some(Some("default")) => Ok(None),
-            Some(Some("channels_last" | "tf")) => Ok(Some(AxisOrder::ChannelsLast)),
-            Some(Some("channels_first" | "th")) => Ok(Some(AxisOrder::ChannelsFirst)),
-            Some(other) => Err(format!("order of axes `{}` is unknown", shown(other.unwrap_or("of an unknown kind")))),
-        }
-    }
-
-    fn input(&self) -> Result<Option<Vec<usize>>, String> {
-        let Some((name, value)) = self.find(&["batch_shape", "batch_input_shape"]) else { return Ok(None) };
-        let extents = value.as_array().and_then(|extents| extents.get(1..));
-        let extents: Option<Vec<usize>> =
-            extents.and_then(|all| all.iter().map(|n| if n.is_null() { Some(0) } else { size(n) }).collect());
-        extents.map(Some).ok_or_else(|| format!("`{name}` must be a list of sizes, not {}", short(value)))
-    }
-
-    /// The layer that the option `activation` stands for.
-    fn activation(&self) -> Result<Option<LayerSpec>, String> {
-        self.find(&["activation"]).map_or(Ok(None), |(_, value)| activation(value))
-    }
-}
-
-fn activation(value: &Value) -> Result<Option<LayerSpec>, String> {
-    let name = match value {
-        Value::String(name) => name.as_str(),
-        Value::Object(object) => {
-            let class = object.get("class_name").and_then(Value::as_str).unwrap_or_default();
-            match object.get("config") {
-                // A function, by name.
-                Some(Value::String(name)) => name.as_str(),
-                Some(Value::Object(config)) => {
-                    let found = pointwise(class, &Options(config))?;
-                    return found.map(Some).ok_or_else(|| format!("activation `{}` has no counterpart", shown(class)));
-                }
-                _ => class,
-            }
-        }
-        _ => return Err(format!("activation {} has no counterpart", short(value))),
-    };
-    Ok(Some(match name {
-        "linear" => return Ok(None),
-        "relu" => ReluSpec {}.into(),
-        "elu" => EluSpec { alpha: 1.0 }.into(),
-        "tanh" => TanhSpec {}.into(),
-        "softsign" => SoftsignSpec {}.into(),
-        "swish" | "silu" => SwishSpec {}.into(),
-        "leaky_relu" => LeakyReluSpec { slope: 0.2 }.into(),
-        _ => return Err(format!("activation `{}` has no counterpart", shown(name))),
-    }))
-}
-
-/// A whole number, also written as 3.0; no larger than any size of a network.
-fn size(value: &Value) -> Option<usize> {
-    let number = value.as_f64().filter(|number| number.fract() == 0.0 && (0.0..=1e9).contains(number))?;
-    Some(number as usize)
-}
-
-fn pair(value: &Value) -> Option<[usize; 2]> {
-    match value.as_array().map(Vec::as_slice) {
-        None => size(value).map(|both| [both, both]),
-        Some([both]) => size(both).map(|both| [both, both]),
-        Some([h, w]) => Some([size(h)?, size(w)?]),
-        Some(_) => None,
-    }
-}
-
-/// A value in a message; no longer than a line.
-fn short(value: &Value) -> String {
-    let text = value.to_string();
-    if text.chars().count() > 60 { text.chars().take(60).chain(['…']).collect() } else { text }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::engine::layers::SwishSpec;
     use serde_json::json;
 
     fn layer(class: &str, config: Value) -> KerasLayer {
