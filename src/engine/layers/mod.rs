@@ -20,7 +20,8 @@
 //! 2. **Kernel test**: the two loops against each other in `kernels/tests/against_reference/` (as in `elementwise.rs`).
 //! 3. **Layer**: a file in this folder or in that of its family, with its `mod` and `pub use` lines. It holds the layer, which
 //!    implements [`Layer`]; its options, which implement [`LayerKind`]: name, family, receptive field, checks, export form; and
-//!    gradient checks with [`gradcheck::check_layer`] (odd sizes, batch 1). Spoil a gradient on purpose and see the check fail.
+//!    gradient checks with [`gradcheck::check_layer`] (odd sizes, batch 1). Spoil a gradient on purpose and see the check fail. The
+//!    options of an activation without trainable numbers implement [`Curve`] instead: layer and answers follow.
 //! 4. **Spec entry**: one line in `network/spec.rs`, the `kind` of recipes with an example.
 //! 5. **Documentation**: the `layers` entry in `data/README.md`, and CHANGELOG.
 //! 6. **Keras reader**, if Keras has the layer: an arm in `exchange/keras/translate.rs`.
@@ -47,8 +48,8 @@ mod scale;
 use std::fmt::Debug;
 
 pub use activation::{
-    Elu, EluSpec, LeakyRelu, LeakyReluSpec, PRelu, PReluSpec, Relu, ReluSpec, Slopes, Softsign, SoftsignSpec, Swish,
-    SwishSpec, Tanh, TanhSpec,
+    Curve, Elementwise, Elu, EluSpec, LeakyRelu, LeakyReluSpec, PRelu, PReluSpec, Relu, ReluSpec, Slopes, Softsign,
+    SoftsignSpec, Swish, SwishSpec, Tanh, TanhSpec,
 };
 pub(crate) use batch_norm::Moments;
 pub use batch_norm::{BatchNorm, BatchNormSpec};

@@ -1,12 +1,11 @@
 //! Leaky rectified linear unit with a fixed slope.
 
 use serde::{Deserialize, Serialize};
-use steersman_kernels::activation;
-use steersman_kernels::{Backend, Isa};
+use steersman_kernels::Isa;
+use steersman_kernels::activation::{leaky_relu_backward, leaky_relu_forward};
 
-use crate::engine::layers::{
-    ExportForm, Family, Formula, Function, Grads, Layer, LayerKind, Pair, Pass, ReceptiveField,
-};
+use super::{Curve, Elementwise};
+use crate::engine::layers::{Formula, Function, Pair};
 use crate::engine::tensor::Shape;
 
 /// Leaky rectified linear unit with a fixed slope (Maas et al. 2013).
@@ -20,44 +19,16 @@ use crate::engine::tensor::Shape;
 /// # Shapes
 ///
 /// x, y, dx, dy: `[n][c][h][w]`.
-#[derive(Debug)]
-pub struct LeakyRelu {
-    shape: Shape,
-    slope: f32,
-    isa: Isa,
-}
+pub type LeakyRelu = Elementwise<LeakyReluSpec>;
 
 impl LeakyRelu {
     /// A leaky ReLU of maps of `shape` with `slope` below zero.
+    ///
+    /// # Errors
+    ///
+    /// As [`Curve::check_options`].
     pub fn new(shape: Shape, slope: f32, isa: Isa) -> Result<LeakyRelu, String> {
-        if !slope.is_finite() {
-            return Err(format!("slope must be a finite number, not {slope}"));
-        }
-        Ok(LeakyRelu { shape, slope, isa })
-    }
-}
-
-impl Layer for LeakyRelu {
-    fn input(&self) -> Shape {
-        self.shape
-    }
-
-    fn output(&self) -> Shape {
-        self.shape
-    }
-
-    fn infer(&self, _params: &[f32], _statistics: &[f32], _n: usize, x: &[f32], y: &mut [f32], _scratch: &mut [f32]) {
-        activation::leaky_relu_forward(self.isa, self.slope, x, y);
-    }
-
-    fn forward(&self, params: &[f32], _pass: &Pass, n: usize, x: &[f32], y: &mut [f32], scratch: &mut [f32]) {
-        self.infer(params, &[], n, x, y, scratch);
-    }
-
-    fn backward(&self, _params: &[f32], _pass: &Pass, _n: usize, pair: Pair, dx: Option<&mut [f32]>, _grads: Grads) {
-        if let Some(dx) = dx {
-            activation::leaky_relu_backward(self.isa, self.slope, pair.x, pair.dy, dx);
-        }
+        Elementwise::of(shape, LeakyReluSpec { slope }, isa)
     }
 }
 
@@ -69,32 +40,29 @@ pub struct LeakyReluSpec {
     pub slope: f32,
 }
 
-impl LayerKind for LeakyReluSpec {
-    fn base_name(&self) -> &'static str {
-        "leaky_relu"
-    }
+impl Curve for LeakyReluSpec {
+    const BASE_NAME: &'static str = "leaky_relu";
 
-    fn describe(&self) -> String {
+    fn title(&self) -> String {
         format!("leaky ReLU {}", self.slope)
     }
 
-    fn family(&self) -> Family {
-        Family::Activation
-    }
-
-    fn receptive_field(&self, _input: Shape) -> ReceptiveField {
-        ReceptiveField::Element
-    }
-
-    fn check(&self, _input: Shape) -> Result<(), String> {
+    fn check_options(&self) -> Result<(), String> {
+        if !self.slope.is_finite() {
+            return Err(format!("slope must be a finite number, not {}", self.slope));
+        }
         Ok(())
     }
 
-    fn layer(&self, input: Shape, backend: Backend) -> Result<Box<dyn Layer>, String> {
-        Ok(Box::new(LeakyRelu::new(input, self.slope, backend.isa)?))
+    fn activate(&self, isa: Isa, x: &[f32], y: &mut [f32]) {
+        leaky_relu_forward(isa, self.slope, x, y);
     }
 
-    fn export_form(&self, _input: Shape, _params: &[f32], _statistics: &[f32]) -> ExportForm {
-        ExportForm::Elementwise(Function::LeakyRelu { slope: self.slope }.of(Formula::X))
+    fn differentiate(&self, isa: Isa, pair: Pair, dx: &mut [f32]) {
+        leaky_relu_backward(isa, self.slope, pair.x, pair.dy, dx);
+    }
+
+    fn formula(&self) -> Formula {
+        Function::LeakyRelu { slope: self.slope }.of(Formula::X)
     }
 }

@@ -1,5 +1,6 @@
-//! Activations: each value by itself.
+//! Activations: each value by itself. One without trainable numbers says what it computes as a [`Curve`].
 
+mod elementwise;
 mod elu;
 mod leaky_relu;
 mod prelu;
@@ -8,6 +9,7 @@ mod softsign;
 mod swish;
 mod tanh;
 
+pub use elementwise::{Curve, Elementwise};
 pub use elu::{Elu, EluSpec};
 pub use leaky_relu::{LeakyRelu, LeakyReluSpec};
 pub use prelu::{PRelu, PReluSpec, Slopes};

@@ -1,12 +1,11 @@
 //! Swish (SiLU).
 
 use serde::{Deserialize, Serialize};
-use steersman_kernels::activation;
-use steersman_kernels::{Backend, Isa};
+use steersman_kernels::Isa;
+use steersman_kernels::activation::{swish_backward, swish_forward};
 
-use crate::engine::layers::{
-    ExportForm, Family, Formula, Function, Grads, Layer, LayerKind, Pair, Pass, ReceptiveField,
-};
+use super::{Curve, Elementwise};
+use crate::engine::layers::{Formula, Function, Pair};
 use crate::engine::tensor::Shape;
 
 /// Swish with beta 1, also called SiLU (Elfwing et al. 2017, Ramachandran et al. 2017).
@@ -19,40 +18,12 @@ use crate::engine::tensor::Shape;
 /// # Shapes
 ///
 /// x, y, dx, dy: `[n][c][h][w]`.
-#[derive(Debug)]
-pub struct Swish {
-    shape: Shape,
-    isa: Isa,
-}
+pub type Swish = Elementwise<SwishSpec>;
 
 impl Swish {
     /// Swish of maps of `shape`.
     pub fn new(shape: Shape, isa: Isa) -> Swish {
-        Swish { shape, isa }
-    }
-}
-
-impl Layer for Swish {
-    fn input(&self) -> Shape {
-        self.shape
-    }
-
-    fn output(&self) -> Shape {
-        self.shape
-    }
-
-    fn infer(&self, _params: &[f32], _statistics: &[f32], _n: usize, x: &[f32], y: &mut [f32], _scratch: &mut [f32]) {
-        activation::swish_forward(self.isa, x, y);
-    }
-
-    fn forward(&self, params: &[f32], _pass: &Pass, n: usize, x: &[f32], y: &mut [f32], scratch: &mut [f32]) {
-        self.infer(params, &[], n, x, y, scratch);
-    }
-
-    fn backward(&self, _params: &[f32], _pass: &Pass, _n: usize, pair: Pair, dx: Option<&mut [f32]>, _grads: Grads) {
-        if let Some(dx) = dx {
-            activation::swish_backward(self.isa, pair.x, pair.dy, dx);
-        }
+        Elementwise { shape, curve: SwishSpec {}, isa }
     }
 }
 
@@ -61,39 +32,30 @@ impl Layer for Swish {
 #[serde(deny_unknown_fields)]
 pub struct SwishSpec {}
 
-impl LayerKind for SwishSpec {
-    fn base_name(&self) -> &'static str {
-        "swish"
-    }
+impl Curve for SwishSpec {
+    const BASE_NAME: &'static str = "swish";
 
-    fn describe(&self) -> String {
+    fn title(&self) -> String {
         "swish".into()
     }
 
-    fn family(&self) -> Family {
-        Family::Activation
+    fn activate(&self, isa: Isa, x: &[f32], y: &mut [f32]) {
+        swish_forward(isa, x, y);
     }
 
-    fn receptive_field(&self, _input: Shape) -> ReceptiveField {
-        ReceptiveField::Element
+    fn differentiate(&self, isa: Isa, pair: Pair, dx: &mut [f32]) {
+        swish_backward(isa, pair.x, pair.dy, dx);
     }
 
-    fn check(&self, _input: Shape) -> Result<(), String> {
-        Ok(())
-    }
-
-    fn layer(&self, input: Shape, backend: Backend) -> Result<Box<dyn Layer>, String> {
-        Ok(Box::new(Swish::new(input, backend.isa)))
-    }
-
-    fn export_form(&self, _input: Shape, _params: &[f32], _statistics: &[f32]) -> ExportForm {
-        ExportForm::Elementwise(Formula::X * Function::Sigmoid.of(Formula::X))
+    fn formula(&self) -> Formula {
+        Formula::X * Function::Sigmoid.of(Formula::X)
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::engine::layers::Layer;
     use crate::engine::layers::gradcheck::check_layer;
 
     #[test]
