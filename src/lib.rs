@@ -51,7 +51,6 @@
 //! A recording is a folder with a `driving_log.csv`, or a donkeycar tub; `data/sample` is a very short one.
 //!
 //! ```
-//! use steersman::dataset::Description;
 //! use steersman::observer::StopSignal;
 //! use steersman::recipe::Recipe;
 //! use steersman::training::{TrainRequest, TrainingEvent, train};
@@ -63,9 +62,7 @@
 //! # */
 //! // The recipe is the experiment: preprocessing, network, split, optimizer. A path ending in .toml names one of your own.
 //! let recipe = Recipe::find("lenet", &["epochs=2".into(), "batch=16".into()])?;
-//! let (recordings, validate, also, simulator) = (vec!["data/sample".into()], vec![], vec![], vec![]);
-//! let (said, from, algorithm, profile) = (Description::default(), None, None, false);
-//! let request = TrainRequest { recordings, validate, also, simulator, said, recipe, out, seed: 1, cache_mib: 64, from, algorithm, profile };
+//! let request = TrainRequest { seed: 7, ..TrainRequest::new(vec!["data/sample".into()], recipe, out) };
 //! let stop = StopSignal::default(); // requested from elsewhere, it ends the run after the current batch
 //! let mut observer = |event| {
 //!     match event {

@@ -6,7 +6,6 @@
 use std::path::Path;
 
 use steersman::Error;
-use steersman::dataset::Description;
 use steersman::main_job::experiment::{self, ExperimentEvent, ExperimentPlan, Subject, write_csv};
 use steersman::main_job::job::{Job, JobEvent, JobNote, JobRequest, Scope};
 use steersman::main_job::training_set::{Take, recordings};
@@ -24,20 +23,9 @@ fn learn(folder: &Path, threads: usize) -> (TrainResult, TrackResult) {
     let overrides = ["epochs=8", "samples.flip=both", "samples.side_cameras=0.25"].map(String::from);
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
     pool.install(|| {
-        let request = TrainRequest {
-            recordings: recordings(&folder.join("recordings"), &takes, None, &mut Unobserved).unwrap().0,
-            validate: Vec::new(),
-            also: Vec::new(),
-            simulator: Vec::new(),
-            said: Description::default(),
-            recipe: Recipe::find("lenet", &overrides).unwrap(),
-            out: folder.join(format!("run-{threads}")),
-            seed: 1,
-            cache_mib: 256,
-            from: None,
-            profile: false,
-            algorithm: None,
-        };
+        let recordings = recordings(&folder.join("recordings"), &takes, None, &mut Unobserved).unwrap().0;
+        let recipe = Recipe::find("lenet", &overrides).unwrap();
+        let request = TrainRequest::new(recordings, recipe, folder.join(format!("run-{threads}")));
         let result = train(request, &mut Unobserved, &StopSignal::default()).unwrap();
         let pilot = Pilot::load(&result.model).unwrap();
         let options = DriveOptions { runs: 4, ..Default::default() };

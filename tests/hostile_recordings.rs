@@ -363,20 +363,8 @@ fn damaged_runs_go_on_or_are_refused() {
     common::painted_log::write(&log, 60, "");
     let layers = "layers=[{kind='scale', factor=0.004, offset=-0.5}, {kind='flatten'}, {kind='dense', units=1}]";
     let settings = [layers, "preprocessing.resize=[8, 8]", "batch=8", "epochs=3", "split.validation_share=0"];
-    let request = TrainRequest {
-        validate: Vec::new(),
-        also: Vec::new(),
-        simulator: Vec::new(),
-        recordings: vec![log],
-        said: Description::default(),
-        recipe: Recipe::find("lenet", &settings.map(String::from)).unwrap(),
-        out: run.clone(),
-        seed: 5,
-        cache_mib: 1,
-        from: None,
-        algorithm: None,
-        profile: false,
-    };
+    let recipe = Recipe::find("lenet", &settings.map(String::from)).unwrap();
+    let request = TrainRequest { seed: 5, cache_mib: 1, ..TrainRequest::new(vec![log], recipe, run.clone()) };
     // It stops after its first epoch.
     let stop = StopSignal::default();
     let mut observer = |event: TrainingEvent| {

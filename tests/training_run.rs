@@ -11,7 +11,6 @@ use std::path::{Path, PathBuf};
 use common::command::json;
 use common::painted_log;
 use serde_json::Value;
-use steersman::dataset::Description;
 use steersman::engine::network::Parameters;
 use steersman::model_file::Model;
 use steersman::observer::StopSignal;
@@ -139,20 +138,9 @@ fn the_mean_absolute_error_is_in_degrees_of_the_front_wheels() {
 /// A run on `log` that keeps no decoded image, with what it told; `at_batch` is called before batch 2 is trained on.
 fn watched(log: &Path, out: &Path, at_batch: &dyn Fn()) -> (steersman::Result<TrainResult>, Vec<TrainingEvent>) {
     let settings = [LINEAR, "preprocessing.resize=[16, 16]", "batch=8", "epochs=2"].map(String::from);
-    let request = TrainRequest {
-        recordings: vec![log.to_path_buf()],
-        validate: Vec::new(),
-        also: Vec::new(),
-        simulator: Vec::new(),
-        said: Description::default(),
-        recipe: Recipe::find("lenet", &settings).unwrap(),
-        out: out.to_path_buf(),
-        seed: 5,
-        cache_mib: 1,
-        from: None,
-        algorithm: None,
-        profile: false,
-    };
+    let request =
+        TrainRequest::new(vec![log.to_path_buf()], Recipe::find("lenet", &settings).unwrap(), out.to_path_buf());
+    let request = TrainRequest { seed: 5, cache_mib: 1, ..request };
     let (mut events, mut batches) = (Vec::new(), 0);
     let mut observer = |event: TrainingEvent| {
         if let TrainingEvent::Batch { .. } = event {
@@ -272,19 +260,11 @@ fn a_run_with_the_simulators_set_goes_on_with_it_and_tells_of_it() {
         "samples.simulator_share=0.4",
         "balance.keep_zero=1.0",
     ];
+    let recipe = Recipe::find("lenet", &settings.map(String::from)).unwrap();
     let request = |out: &str, simulator: &[&Path]| TrainRequest {
-        recordings: vec![log.clone()],
-        validate: Vec::new(),
-        also: Vec::new(),
         simulator: simulator.iter().map(|path| path.to_path_buf()).collect(),
-        said: Description::default(),
-        recipe: Recipe::find("lenet", &settings.map(String::from)).unwrap(),
-        out: folder.path().join(out),
         seed: 5,
-        cache_mib: 64,
-        from: None,
-        algorithm: None,
-        profile: false,
+        ..TrainRequest::new(vec![log.clone()], recipe.clone(), folder.path().join(out))
     };
     let stop = StopSignal::default();
     let train = |out: &str, simulator: &[&Path]| {

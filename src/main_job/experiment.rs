@@ -251,19 +251,12 @@ pub fn run(
     for (variant, recipe) in variants {
         for seed in 1..=plan.seeds {
             observer.observe(ExperimentEvent::Job(JobEvent::Notice(format!("{variant}, seed {seed}"))))?;
+            let out = folder.path().join(format!("{variant}-{seed}"));
             let request = TrainRequest {
-                recordings: plan.recordings.clone(),
-                validate: Vec::new(),
-                also: Vec::new(),
-                simulator: Vec::new(),
                 said: plan.said.clone(),
-                recipe: recipe.clone(),
-                out: folder.path().join(format!("{variant}-{seed}")),
                 seed,
                 cache_mib: plan.cache_mib,
-                from: None,
-                profile: false,
-                algorithm: None,
+                ..TrainRequest::new(plan.recordings.clone(), recipe.clone(), out)
             };
             let mut of_job = |event| observer.observe(ExperimentEvent::Job(event));
             let training = training::train(request, &mut |event| of_job(JobEvent::Training(event)), stop)?;

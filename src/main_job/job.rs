@@ -9,7 +9,6 @@ use steersman_kernels::conv::ConvAlgorithm;
 use super::training_set::{self, Take};
 use super::{MainJobResult, TRACKS, TrackResult, dagger, test_on_track};
 
-use crate::dataset::Description;
 use crate::error::{Error, Result};
 use crate::files::checksums;
 use crate::geometry::CarGeometry;
@@ -174,20 +173,8 @@ impl<'a> Job<'a> {
         let takes = training_set::labelled(&self.scope.takes, &recipe);
         let recordings = training_set(&self.scope.recordings, &takes, None, self.observer, self.stop)?;
         let profile = self.profile;
-        let training = self.train(TrainRequest {
-            recordings,
-            validate: Vec::new(),
-            also: Vec::new(),
-            simulator: Vec::new(),
-            said: Description::default(),
-            recipe,
-            out,
-            seed,
-            cache_mib,
-            from,
-            profile,
-            algorithm,
-        })?;
+        let request = TrainRequest::new(recordings, recipe, out);
+        let training = self.train(TrainRequest { seed, cache_mib, from, profile, algorithm, ..request })?;
         self.rest(training)
     }
 
@@ -254,20 +241,8 @@ impl<'a> Job<'a> {
             return self.resume(&out);
         }
         let (seed, cache_mib, profile) = (info.seed, info.cache_mib, self.profile);
-        self.train(TrainRequest {
-            recordings,
-            validate: Vec::new(),
-            also: Vec::new(),
-            simulator: Vec::new(),
-            said: Description::default(),
-            recipe,
-            out,
-            seed,
-            cache_mib,
-            from: None,
-            profile,
-            algorithm,
-        })
+        let request = TrainRequest::new(recordings, recipe, out);
+        self.train(TrainRequest { seed, cache_mib, profile, algorithm, ..request })
     }
 
     /// Whether `out` holds the run of this job's round on `recordings` already, begun before a stop.

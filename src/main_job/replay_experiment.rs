@@ -8,7 +8,7 @@ use serde::Serialize;
 use steersman_kernels::Isa;
 
 use super::job::{JobEvent, test_on_tracks};
-use crate::dataset::{self, Description, Recording};
+use crate::dataset::{self, Recording};
 use crate::engine::random::{Purpose, rng, unit};
 use crate::error::{Error, Result};
 use crate::files::atomic_file;
@@ -228,20 +228,10 @@ pub fn run(
         let mut of_job = |event| observer.observe(ReplayExperimentEvent::Job(event));
         let model = match origin {
             Origin::Trained { recipe, epochs, seed, share } => {
-                let request = TrainRequest {
-                    recordings: trained[usize::from(*share == Share::Tenth)].clone(),
-                    validate: Vec::new(),
-                    also: Vec::new(),
-                    simulator: Vec::new(),
-                    said: Description::default(),
-                    recipe: Recipe::find(recipe, &[format!("epochs={epochs}")])?,
-                    out: folder.join(format!("run-{number}")),
-                    seed: *seed,
-                    cache_mib: plan.cache_mib,
-                    from: None,
-                    profile: false,
-                    algorithm: None,
-                };
+                let recordings = trained[usize::from(*share == Share::Tenth)].clone();
+                let recipe = Recipe::find(recipe, &[format!("epochs={epochs}")])?;
+                let request = TrainRequest::new(recordings, recipe, folder.join(format!("run-{number}")));
+                let request = TrainRequest { seed: *seed, cache_mib: plan.cache_mib, ..request };
                 let result = training::train(request, &mut |event| of_job(JobEvent::Training(event)), stop)?;
                 Model::load(&result.model)?
             }

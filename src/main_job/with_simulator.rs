@@ -1,14 +1,58 @@
-//! `train RECORDING --with-simulator`: the simulator's set, as the camera of a recording sees it.
+//! `train RECORDING --with-simulator`: the simulator's set, as the camera of a recording sees it; and what is told of recordings that are
+//! trained on.
 
 use std::path::{Path, PathBuf};
 
-use super::job::{JobEvent, training_set};
-use super::training_set::Take;
+use super::job::{JobEvent, RECORDINGS, training_set};
+use super::training_set::{self, Take};
+use crate::dataset::held_out::{self, trained_on_held_out};
 use crate::dataset::{self, Description, ImageCheck};
 use crate::error::{Error, Result};
 use crate::geometry::CarGeometry;
 use crate::observer::{Observer, StopSignal};
+use crate::recipe::Recipe;
 use crate::simulator::camera::foreign_car;
+
+/// What a training on a user's recordings may do beside.
+#[derive(Clone, Copy, Debug)]
+pub struct Allowed {
+    /// Train on the simulator's set as well, with this share of an epoch if it is not the recipe's.
+    pub with_simulator: Option<Option<f64>>,
+    /// Train on recordings of held-out tracks all the same.
+    pub held_out: bool,
+}
+
+/// Before a training of `recipe` on the recordings `training`, with `validation` as its other side, of all of which the user says `said`:
+/// refuses held-out tracks, sets the simulator's share in the recipe, and returns the recordings of the simulator's set, recorded now
+/// if they are not there; none without it. `notice` is told what the user should know.
+///
+/// # Errors
+///
+/// [`Error::Usage`] for held-out tracks and for a share that cannot be; as [`simulator_set`].
+pub fn beside_recordings(
+    recipe: &mut Recipe,
+    [training, validation]: [&[PathBuf]; 2],
+    said: &Description,
+    allowed: Allowed,
+    notice: &mut dyn FnMut(&str),
+    observer: &mut (dyn Observer<JobEvent> + Send),
+    stop: &StopSignal,
+) -> Result<Vec<PathBuf>> {
+    if let Some(Some(share)) = allowed.with_simulator {
+        recipe.samples.simulator_share = share;
+        recipe.samples.validate()?;
+    }
+    let held_out = held_out::check(training, allowed.held_out)?;
+    if !held_out.is_empty() {
+        notice(&trained_on_held_out(&held_out));
+    }
+    if allowed.with_simulator.is_none() {
+        recipe.labels.notice_without_expert().into_iter().for_each(notice);
+        return Ok(Vec::new());
+    }
+    let takes = training_set::labelled(&training_set::takes(), recipe);
+    simulator_set(RECORDINGS.as_ref(), &takes, &[training, validation].concat(), said, observer, stop)
+}
 
 /// The recordings of `takes` under `folder` with camera and car of `recordings`, of which the user says `said`; recorded now if they
 /// are not there.
@@ -17,7 +61,7 @@ use crate::simulator::camera::foreign_car;
 ///
 /// [`Error::Usage`] if the recordings have different cameras, or one that the simulator cannot have; as [`training_set`] and
 /// [`dataset::load_with`].
-pub fn simulator_set(
+fn simulator_set(
     folder: &Path,
     takes: &[Take],
     recordings: &[PathBuf],

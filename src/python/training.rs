@@ -9,12 +9,9 @@ use pyo3::types::PyDict;
 use super::arrays::{plain, said};
 use super::work::{self, Reporter};
 use crate::cli::arguments::model_file;
-use crate::dataset::held_out::{self, trained_on_held_out};
 use crate::error::{Error, Result};
-use crate::main_job::job::RECORDINGS;
 use crate::main_job::on_recording::judge_run;
-use crate::main_job::training_set;
-use crate::main_job::with_simulator::simulator_set;
+use crate::main_job::with_simulator::{Allowed, beside_recordings};
 use crate::model_file::Model;
 use crate::recipe::Recipe;
 use crate::report;
@@ -42,44 +39,16 @@ pub(super) fn train(
             (recipe, _) => Recipe::find(recipe.as_deref().unwrap_or("recording"), &overrides)?,
         };
         let from = from.map(|model| TransferRequest { model, freeze });
-        if let Some(Some(share)) = with_simulator {
-            recipe.samples.simulator_share = share;
-            recipe.samples.validate()?;
-        }
-        let held_out = held_out::check(&recordings, force_held_out)?;
-        if !held_out.is_empty() {
-            reporter.notice(trained_on_held_out(&held_out));
-        }
-        let simulator = match with_simulator {
-            Some(_) => {
-                let (of_user, takes) =
-                    ([&recordings[..], &validate].concat(), training_set::labelled(&training_set::takes(), &recipe));
-                let stop = reporter.stop.clone();
-                simulator_set(RECORDINGS.as_ref(), &takes, &of_user, &said, reporter, &stop)?
-            }
-            None => {
-                recipe.labels.notice_without_expert().into_iter().for_each(|notice| reporter.notice(notice));
-                Vec::new()
-            }
-        };
+        let allowed = Allowed { with_simulator, held_out: force_held_out };
+        let (told, stop) = (reporter.clone(), reporter.stop.clone());
+        let mut notice = |text: &str| told.notice(text);
+        let sides = [&recordings[..], &validate];
+        let simulator = beside_recordings(&mut recipe, sides, &said, allowed, &mut notice, reporter, &stop)?;
         let run = NewRun::at(out, &recipe.name)?;
         let out = run.path().to_path_buf();
         begun = Some(out.clone());
-        let request = TrainRequest {
-            recordings,
-            validate,
-            also: Vec::new(),
-            simulator,
-            said,
-            recipe,
-            out,
-            seed,
-            cache_mib,
-            from,
-            algorithm: None,
-            profile: false,
-        };
-        let stop = reporter.stop.clone();
+        let request = TrainRequest::new(recordings, recipe, out);
+        let request = TrainRequest { validate, simulator, said, seed, cache_mib, from, ..request };
         run.settle(training::train(request, reporter, &stop))?;
         finish(begun.as_deref().unwrap_or(Path::new("")), reporter)
     });

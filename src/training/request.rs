@@ -41,6 +41,29 @@ pub struct TrainRequest {
     pub profile: bool,
 }
 
+/// Memory for decoded images unless another is asked for, MiB.
+pub const DEFAULT_CACHE_MIB: usize = 1024;
+
+impl TrainRequest {
+    /// To train `recipe` on `recordings` alone, of which nothing is said, into the run folder `out`: seed 1, fresh weights.
+    pub fn new(recordings: Vec<PathBuf>, recipe: Recipe, out: PathBuf) -> TrainRequest {
+        TrainRequest {
+            recordings,
+            validate: Vec::new(),
+            also: Vec::new(),
+            simulator: Vec::new(),
+            said: Description::default(),
+            recipe,
+            out,
+            seed: 1,
+            cache_mib: DEFAULT_CACHE_MIB,
+            from: None,
+            algorithm: None,
+            profile: false,
+        }
+    }
+}
+
 /// What happens in a run.
 #[derive(Clone, Debug, PartialEq)]
 pub enum TrainingEvent {

@@ -19,6 +19,7 @@ use crate::main_job::job::{RECORDINGS, training_set};
 use crate::main_job::training_set::{RANDOM_TRACKS, labelled};
 use crate::observer::Observer;
 use crate::simulator::Track;
+use crate::training::DEFAULT_CACHE_MIB;
 use replay::ReplayExperimentArgs;
 
 /// Trainings of each variant.
@@ -63,7 +64,7 @@ pub struct ExperimentArgs {
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
     /// Memory for decoded images, in MiB
-    #[arg(long, default_value_t = 1024, value_name = "MIB")]
+    #[arg(long, default_value_t = DEFAULT_CACHE_MIB, value_name = "MIB")]
     cache: usize,
     /// Threads; 0 is one for each core
     #[arg(long, default_value_t = 0)]

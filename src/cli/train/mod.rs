@@ -13,20 +13,20 @@ use steersman_kernels::conv::ConvAlgorithm;
 use super::arguments::{RecipeArgs, RecordingArgs, model_file};
 use super::process::{pool, stop_on_ctrl_c};
 use super::terminal::{JobDisplay, beside_steering, counted, or_dash, print, print_json};
-use crate::dataset::held_out::{self, trained_on_held_out};
+use crate::dataset::held_out::trained_on_held_out;
 use crate::error::{Error, Result};
 use crate::live::{self, training::TrainingPage};
 use crate::main_job::dagger_on_log::{self, DaggerNote, Round};
-use crate::main_job::job::{Job, JobEvent, JobNote, JobRequest, RECORDINGS, Scope};
+use crate::main_job::job::{Job, JobEvent, JobNote, JobRequest, Scope};
 use crate::main_job::on_recording::judge_run;
-use crate::main_job::with_simulator::simulator_set;
-use crate::main_job::{MainJobResult, TrackResult, training_set};
+use crate::main_job::with_simulator::{Allowed, beside_recordings};
+use crate::main_job::{MainJobResult, TrackResult};
 use crate::observer::{Observer, StopSignal};
 use crate::recipe::Recipe;
 use crate::replay::RecordingVerdict;
 use crate::report;
 use crate::text::percent;
-use crate::training::{self, NewRun, RunFolder, TrainRequest, TrainResult, TransferRequest};
+use crate::training::{self, DEFAULT_CACHE_MIB, NewRun, RunFolder, TrainRequest, TrainResult, TransferRequest};
 
 /// Time of one core (Zen 3, 2.4 GHz) for recording and for driving, s.
 const SIMULATOR_CORE_S: f64 = 160.0;
@@ -72,7 +72,7 @@ pub struct TrainArgs {
     #[arg(long, value_name = "NAME")]
     algorithm: Option<ConvAlgorithm>,
     /// Memory for decoded images, in MiB; what does not fit goes to a temporary file
-    #[arg(long, default_value_t = 1024, value_name = "MIB")]
+    #[arg(long, default_value_t = DEFAULT_CACHE_MIB, value_name = "MIB")]
     cache: usize,
     /// Go on with a run that was stopped, as if it had never stopped
     #[arg(long, value_name = "RUN", conflicts_with_all = ["recordings", "validate", "recipe", "overrides", "out", "seed", "cache", "algorithm"])]
@@ -192,49 +192,28 @@ pub fn run(args: TrainArgs) -> Result<()> {
             (folder, note, result)
         }
         None => {
-            let mut recipe = recipe()?;
-            if let Some(Some(share)) = args.with_simulator {
-                recipe.samples.simulator_share = share;
-                recipe.samples.validate()?;
-            }
-            let recordings = args.reading.expand(args.recordings)?;
-            let held_out = held_out::check(&recordings, args.force_held_out)?;
-            if !held_out.is_empty() {
-                eprintln!("note: {}", trained_on_held_out(&held_out));
-            }
-            let validate = args.reading.expand(args.validate)?;
-            let simulator = match args.with_simulator {
-                Some(_) => {
-                    let (of_user, said, takes) = (
-                        [&recordings[..], &validate].concat(),
-                        args.reading.said(),
-                        training_set::labelled(&training_set::takes(), &recipe),
-                    );
-                    let set = || simulator_set(RECORDINGS.as_ref(), &takes, &of_user, &said, &mut display, &stop);
-                    let set = pool.install(set);
-                    display.finish();
-                    explain_stop(set, None)?
-                }
-                None => {
-                    recipe.labels.notice_without_expert().iter().for_each(|notice| eprintln!("note: {notice}"));
-                    Vec::new()
-                }
-            };
+            let (mut recipe, said) = (recipe()?, args.reading.said());
+            let [recordings, validate] = [args.recordings, args.validate].map(|paths| args.reading.expand(paths));
+            let (recordings, validate) = (recordings?, validate?);
+            let allowed = Allowed { with_simulator: args.with_simulator, held_out: args.force_held_out };
+            let sides = [&recordings[..], &validate];
+            let mut notice = |text: &str| eprintln!("note: {text}");
+            let set = || beside_recordings(&mut recipe, sides, &said, allowed, &mut notice, &mut display, &stop);
+            let simulator = pool.install(set);
+            display.finish();
+            let simulator = explain_stop(simulator, None)?;
             let run = NewRun::at(args.out, &recipe.name)?;
             let out = run.path().to_path_buf();
             let request = TrainRequest {
-                recordings,
                 validate,
-                also: Vec::new(),
                 simulator,
-                said: args.reading.said(),
-                recipe,
-                out: out.clone(),
+                said,
                 seed: args.seed,
                 cache_mib: args.cache,
                 from,
                 profile: args.profile,
                 algorithm: args.algorithm,
+                ..TrainRequest::new(recordings, recipe, out.clone())
             };
             let note = (args.dagger > 0).then_some(DaggerNote { rounds: args.dagger, round: 0 });
             let free = (1..=args.dagger).try_for_each(|round| dagger_on_log::require_free(&out, round));
