@@ -7,7 +7,7 @@
 use rayon::prelude::*;
 
 use super::log::{Frames, ReplayLog};
-use super::trust::{MAX_ROW_SHARE, rows_with_all_cameras};
+use super::side_cameras::{difference_on, rows_with_all_cameras, shared_ground};
 use crate::dataset::View;
 use crate::error::Result;
 use crate::geometry::{CarGeometry, Offset, PixelGrid, ViewWarp};
@@ -59,7 +59,7 @@ pub fn fit_camera(log: &ReplayLog) -> Result<Option<CameraFit>> {
     let triples: Vec<Triple> = triples.into_iter().flatten().collect();
     let Some(size) = log.recording.image_size.filter(|_| !triples.is_empty()) else { return Ok(None) };
     // All candidates are judged by the same pixels.
-    let masks = assumed.side_offsets_m.map(|wanted_m| ground(assumed, size, wanted_m));
+    let masks = warps_to_sides(assumed, size).map(|warp| shared_ground(&warp, size));
     let mount = |found: [f64; 3]| CarGeometry {
         height_m: found[0].clamp(0.01, 100.0),
         pitch_deg: found[1].clamp(-80.0, 80.0),
@@ -110,21 +110,16 @@ fn triple<'a>(log: &ReplayLog<'a>, frames: &mut Frames<'a>, row: usize) -> Resul
     })
 }
 
-/// Which pixels of a side picture show ground that the centre picture shows, too, without the bonnet.
-fn ground(geometry: &CarGeometry, [h, w]: [usize; 2], wanted_m: f64) -> Vec<bool> {
-    let grid = PixelGrid::whole(geometry, [h, w]);
-    let warp = ViewWarp::between(geometry, grid, 0.0, Offset::default(), wanted_m);
-    let seen = |i: usize| warp.sees_ground((i % w) as f64 + 0.5, (i / w) as f64 + 0.5);
-    (0..h * w).map(|i| seen(i) && (i / w) as f64 <= MAX_ROW_SHARE * h as f64).collect()
+/// The warps of the centre picture to the side cameras.
+fn warps_to_sides(geometry: &CarGeometry, size: [usize; 2]) -> [ViewWarp; 2] {
+    let grid = PixelGrid::whole(geometry, size);
+    geometry.side_offsets_m.map(|wanted_m| ViewWarp::between(geometry, grid, 0.0, Offset::default(), wanted_m))
 }
 
 /// Mean difference in grey levels between the side pictures and what `geometry` makes of the centre picture, or the centre picture as it
 /// is.
 fn difference(triples: &[Triple], masks: &[Vec<bool>; 2], size: [usize; 2], geometry: Option<&CarGeometry>) -> f64 {
-    let warps = geometry.map(|geometry| {
-        let grid = PixelGrid::whole(geometry, size);
-        geometry.side_offsets_m.map(|wanted_m| ViewWarp::between(geometry, grid, 0.0, Offset::default(), wanted_m))
-    });
+    let warps = geometry.map(|geometry| warps_to_sides(geometry, size));
     let compare = |predicted: &mut Vec<u8>, triple: &Triple| -> u64 {
         predicted.resize(triple.centre.len(), 0);
         let side = |i: usize| -> u64 {
@@ -132,9 +127,7 @@ fn difference(triples: &[Triple], masks: &[Vec<bool>; 2], size: [usize; 2], geom
                 Some(warps) => warps[i].apply(&triple.centre, predicted),
                 None => predicted.copy_from_slice(&triple.centre),
             }
-            let pixels = predicted.as_chunks::<3>().0.iter().zip(triple.sides[i].as_chunks::<3>().0);
-            let ground = pixels.zip(&masks[i]).filter(|(_, ground)| **ground);
-            ground.map(|((a, b), _)| (0..3).map(|c| u64::from(a[c].abs_diff(b[c]))).sum::<u64>()).sum()
+            difference_on(&masks[i], predicted, &triple.sides[i])
         };
         [0, 1].map(side).iter().sum()
     };

@@ -11,6 +11,7 @@
 mod fit;
 mod log;
 mod run;
+mod side_cameras;
 mod trust;
 mod verdict;
 
