@@ -20,40 +20,47 @@ fn prefix(path: &Path) -> String {
 
 /// A new file beside `path` under a hidden name, which is removed if it is dropped. It is locked as long as it is open.
 pub(super) fn new_file(parent: &Path, path: &Path) -> io::Result<NamedTempFile> {
-    remove_left_over(parent, &prefix(path));
-    for _ in 0..MAX_ATTEMPTS {
-        let prefix = prefix(path);
-        let mut builder = tempfile::Builder::new();
-        builder.prefix(&prefix);
-        // Temporary files are for their owner alone; a model or a video is as readable as any other file.
-        #[cfg(unix)]
-        builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
+    until_locked(parent, path, "file", 0o666, |builder| {
         let file = builder.tempfile_in(parent)?;
-        if !matches!(file.as_file().try_lock(), Err(fs::TryLockError::WouldBlock)) {
-            return Ok(file);
-        }
-    }
-    Err(io::Error::new(ErrorKind::AlreadyExists, "another process takes every temporary file away"))
+        let taken = matches!(file.as_file().try_lock(), Err(fs::TryLockError::WouldBlock));
+        Ok((!taken).then_some(file))
+    })
 }
 
 /// A new folder beside `path` under a hidden name, and its lock. It is removed if it is dropped.
 pub(super) fn new_folder(parent: &Path, path: &Path) -> io::Result<(TempDir, Lock)> {
-    remove_left_over(parent, &prefix(path));
-    for _ in 0..MAX_ATTEMPTS {
-        let prefix = prefix(path);
-        let mut builder = tempfile::Builder::new();
-        builder.prefix(&prefix);
-        // Temporary folders are for their owner alone; this one is as readable as any other folder.
-        #[cfg(unix)]
-        builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o777));
+    until_locked(parent, path, "folder", 0o777, |builder| {
         let folder = builder.tempdir_in(parent)?;
         match Lock::try_take(folder.path()) {
-            Ok(Some(lock)) => return Ok((folder, lock)),
-            Err(error) if error.kind() != ErrorKind::NotFound => return Err(error),
-            _ => {}
+            Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
+            lock => Ok(lock?.map(|lock| (folder, lock))),
+        }
+    })
+}
+
+/// What `make` makes beside `path`, once it is locked: `make` answers `None` if a cleaner has taken it away before. `mode` are its
+/// permissions: temporary files and folders are for their owner alone, but a model or a video is as readable as any other file.
+fn until_locked<T>(
+    parent: &Path,
+    path: &Path,
+    what: &str,
+    mode: u32,
+    make: impl Fn(&tempfile::Builder) -> io::Result<Option<T>>,
+) -> io::Result<T> {
+    let prefix = prefix(path);
+    remove_left_over(parent, &prefix);
+    let mut builder = tempfile::Builder::new();
+    builder.prefix(&prefix);
+    #[cfg(unix)]
+    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(mode));
+    #[cfg(not(unix))]
+    let _ = mode;
+    for _ in 0..MAX_ATTEMPTS {
+        if let Some(made) = make(&builder)? {
+            return Ok(made);
         }
     }
-    Err(io::Error::new(ErrorKind::AlreadyExists, "another process takes every temporary folder away"))
+    Err(io::Error::new(ErrorKind::AlreadyExists, format!("another process takes every temporary {what} away")))
 }
 
 /// Removes the unfinished files and folders in `folder` whose process has ended.
