@@ -31,3 +31,8 @@ pub(crate) fn end_with(mut failed: Vec<Error>) -> Result<()> {
     failed.iter().for_each(|error| eprintln!("error: {error}"));
     last.map_or(Ok(()), Err)
 }
+
+/// The end of a command that was stopped, if it was, after it has told what it has.
+pub(crate) fn stop_or_ok(stopped: bool) -> Result<()> {
+    if stopped { Err(Error::Interrupted) } else { Ok(()) }
+}

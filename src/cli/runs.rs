@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 
 use super::arguments::refuse_existing;
-use super::terminal::{print, print_json};
+use super::terminal::{left_aligned, print, print_json};
 use crate::error::Result;
 use crate::files::atomic_file;
 use crate::report::pages::run_list;
@@ -38,22 +38,7 @@ pub fn run(args: RunsArgs) -> Result<()> {
         let places: Vec<String> = args.folders.iter().map(|folder| folder.display().to_string()).collect();
         return print(&format!("no run in {}; `steersman train` begins one\n", places.join(", ")));
     }
-    let rows: Vec<Vec<String>> = lines.iter().map(run_list::RunLine::row).collect();
-    print(&columns(&run_list::HEADERS, &rows))
-}
-
-/// A table whose columns are as wide as they need to be. The last cell of a row that is shorter than the others may be longer.
-fn columns(headers: &[&str], rows: &[Vec<String>]) -> String {
-    let width = |column: usize| {
-        let whole = rows.iter().filter(|row| row.len() == headers.len());
-        let cells = whole.map(|row| row[column].chars().count());
-        cells.chain([headers[column].chars().count()]).max().unwrap_or(0)
-    };
-    let widths: Vec<usize> = (0..headers.len()).map(width).collect();
-    let line = |cells: &[&str]| {
-        let cells: Vec<String> = cells.iter().zip(&widths).map(|(cell, width)| format!("{cell:<width$}")).collect();
-        cells.join("  ").trim_end().to_string() + "\n"
-    };
-    let rows = rows.iter().map(|row| line(&row.iter().map(String::as_str).collect::<Vec<_>>()));
-    line(headers) + &rows.collect::<String>()
+    let headers = run_list::HEADERS.map(String::from).to_vec();
+    let rows: Vec<Vec<String>> = std::iter::once(headers).chain(lines.iter().map(run_list::RunLine::row)).collect();
+    print(&left_aligned(&rows))
 }

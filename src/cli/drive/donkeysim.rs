@@ -5,8 +5,8 @@ use std::path::Path;
 
 use clap::Args;
 
-use super::{DriveArgs, Wheel, stop_or_ok};
-use crate::cli::process::stop_on_ctrl_c;
+use super::{DriveArgs, Wheel};
+use crate::cli::process::{stop_on_ctrl_c, stop_or_ok};
 use crate::cli::terminal::{ShareBar, counted, or_dash, print, print_json};
 use crate::donkeysim::DEFAULT_PORT;
 use crate::donkeysim::client::{DonkeyDrive, DonkeyDriveOptions, DonkeyDriveSummary, DonkeyFrame, drive};

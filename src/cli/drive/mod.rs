@@ -11,7 +11,7 @@ use clap::Args;
 use serde::Serialize;
 
 use super::arguments::{RecordingArgs, Throttle, camera_preset, load_pilot, model_file};
-use super::process::{pool, stop_on_ctrl_c};
+use super::process::{pool, stop_on_ctrl_c, stop_or_ok};
 use super::terminal::{ShareBar, counted, print, print_json};
 use super::video::tell_video;
 #[cfg(feature = "mpi")]
@@ -269,11 +269,6 @@ pub fn run(args: DriveArgs) -> Result<()> {
     }
     print(&text)?;
     saved.and(video.map_or(Ok(()), film)).and(stop_or_ok(stopped))
-}
-
-/// The end of a command that was stopped, if it was, after it has told what it has.
-pub(super) fn stop_or_ok(stopped: bool) -> Result<()> {
-    if stopped { Err(Error::Interrupted) } else { Ok(()) }
 }
 
 /// The command line of this process.

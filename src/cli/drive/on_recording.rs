@@ -7,12 +7,11 @@ use std::time::Instant;
 
 use serde::Serialize;
 
-use super::stop_or_ok;
-use super::sweep::{aligned, ascending};
+use super::sweep::ascending;
 use crate::calm::Calm;
 use crate::cli::arguments::{RecordingArgs, load_pilot, model_file, refuse_existing};
-use crate::cli::process::{end_with, pool, stop_on_ctrl_c};
-use crate::cli::terminal::{ShareBar, print, print_json};
+use crate::cli::process::{end_with, pool, stop_on_ctrl_c, stop_or_ok};
+use crate::cli::terminal::{ShareBar, print, print_json, right_aligned};
 use crate::cli::video::tell_video;
 use crate::error::{Error, Result};
 use crate::files::new_folder::NewFolder;
@@ -249,7 +248,7 @@ fn sweep(args: &ReplayArgs, log: &ReplayLog, pool: &rayon::ThreadPool) -> Result
             format!("{:.1} m/s³", calm.lateral_jerk_rms_mps3),
         ]
     }));
-    print(&format!("{} on the recording\n{}", args.model, aligned(&rows)))?;
+    print(&format!("{} on the recording\n{}", args.model, right_aligned(&rows)))?;
     stop_or_ok(stopped)
 }
 

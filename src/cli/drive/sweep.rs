@@ -4,9 +4,9 @@ use std::path::Path;
 
 use serde::Serialize;
 
-use super::{DriveArgs, Wheel, stop_or_ok};
-use crate::cli::process::{pool, stop_on_ctrl_c};
-use crate::cli::terminal::{counted, print, print_json};
+use super::{DriveArgs, Wheel};
+use crate::cli::process::{pool, stop_on_ctrl_c, stop_or_ok};
+use crate::cli::terminal::{counted, print, print_json, right_aligned};
 use crate::error::{Error, Result};
 use crate::files::new_folder::NewFolder;
 use crate::report::charts::map;
@@ -135,18 +135,7 @@ fn table(track: &Track, runs: usize, sweep: &Sweep) -> String {
         sweep.driver,
         track.name(),
         counted(runs, "run"),
-        aligned(&rows),
+        right_aligned(&rows),
         sweep.verdict()
     )
-}
-
-/// `rows` as lines whose columns end below each other; all rows have as many cells as the first.
-pub(super) fn aligned(rows: &[Vec<String>]) -> String {
-    let width = |column: usize| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
-    let widths: Vec<usize> = (0..rows.first().map_or(0, Vec::len)).map(width).collect();
-    let line = |row: &Vec<String>| {
-        let cells: Vec<String> = row.iter().zip(&widths).map(|(cell, width)| format!("{cell:>width$}")).collect();
-        cells.join("  ") + "\n"
-    };
-    rows.iter().map(line).collect()
 }

@@ -16,6 +16,7 @@ macro_rules! eprintln {
 mod fitted;
 mod progress;
 mod share_bar;
+mod table;
 mod words;
 
 use std::io::{self, IsTerminal, Write};
@@ -24,6 +25,7 @@ use serde::Serialize;
 
 pub(super) use progress::{JobDisplay, beside_steering};
 pub(super) use share_bar::ShareBar;
+pub(super) use table::{left_aligned, right_aligned};
 pub(super) use words::{counted, duration, or_dash};
 
 use crate::error::{Error, Result};
