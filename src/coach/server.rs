@@ -1,13 +1,13 @@
 //! Answers the requests of the page.
 
-use std::io::{Read as _, Write as _};
-use std::time::{Duration, Instant};
+use std::io::Read as _;
+use std::time::Instant;
 
 use super::desk::{Desk, LeftOut, Refusal};
 use crate::dataset::View;
 use crate::net::connections::Peer;
 use crate::net::http::{self, Head};
-use crate::net::loopback::{self, MAX_REQUEST_TIME, Request};
+use crate::net::loopback::{self, MAX_REQUEST_TIME};
 use crate::net::socket::{Socket, is_timeout};
 
 /// The whole page.
@@ -17,39 +17,21 @@ const PAGE: &str = include_str!("page.html");
 const HEADERS: &str = "Content-Security-Policy: default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; \
     img-src 'self' data:; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'\r\n\
     X-Frame-Options: DENY\r\nX-Content-Type-Options: nosniff\r\nReferrer-Policy: no-referrer\r\n\
-    Cross-Origin-Resource-Policy: same-origin\r\n";
+    Cross-Origin-Resource-Policy: same-origin\r\nCache-Control: no-store\r\n";
 /// Longest body of a request: 100,000 single rows.
 const MAX_BODY: usize = 4 << 20;
-/// Time that a browser has to read the last bytes.
-const FAREWELL: Duration = Duration::from_millis(300);
-/// Longest time that a read blocks.
-const TICK: Duration = Duration::from_millis(40);
 
 /// Answers one request. An error ends the connection; there is no one to tell.
 pub(super) fn serve(peer: &Peer, port: u16, desk: &Desk) -> std::io::Result<()> {
-    let mut socket = Socket::new(peer.stream.try_clone()?, TICK)?;
-    let response = match loopback::read_request(&mut socket, &|| desk.is_over())? {
-        None => return Ok(()),
-        Some(Request::Bad(response)) => response.into_bytes(),
-        Some(Request::Head(mut bytes)) => {
-            let head_len = head(&bytes).len;
-            let wanted = head(&bytes).header("content-length").and_then(|len| len.parse().ok()).unwrap_or(0);
-            if wanted > MAX_BODY {
-                http::plain("413 Content Too Large", "the request is too long").into_bytes()
-            } else if read_body(&mut socket, &mut bytes, head_len + wanted)? {
-                answer(&head(&bytes), &bytes[head_len..head_len + wanted], port, desk)
-            } else {
-                return Ok(());
-            }
+    loopback::answer_request(peer, &|| desk.is_over(), |socket, mut bytes| {
+        let head_len = loopback::head(&bytes).len;
+        let wanted = loopback::head(&bytes).header("content-length").and_then(|len| len.parse().ok()).unwrap_or(0);
+        if wanted > MAX_BODY {
+            return Ok(Some(http::plain("413 Content Too Large", "the request is too long").into_bytes()));
         }
-    };
-    socket.write_all(&response)?;
-    socket.finish(FAREWELL);
-    Ok(())
-}
-
-fn head(bytes: &[u8]) -> Head<'_> {
-    Head::parse(bytes).ok().flatten().expect("it was read as a whole request")
+        let is_whole = read_body(socket, &mut bytes, head_len + wanted)?;
+        Ok(is_whole.then(|| answer(&loopback::head(&bytes), &bytes[head_len..head_len + wanted], port, desk)))
+    })
 }
 
 /// Reads until `bytes` are `len` long; `false` if that takes too long, or the client has gone.
@@ -73,21 +55,17 @@ fn read_body(socket: &mut Socket, bytes: &mut Vec<u8>, len: usize) -> std::io::R
 
 /// The response to a request.
 fn answer(head: &Head, body: &[u8], port: u16, desk: &Desk) -> Vec<u8> {
-    let host = match loopback::own_host(head, port) {
-        Ok(host) => host,
-        Err(response) => return response.into_bytes(),
-    };
-    if !loopback::is_own_page(head, host) {
-        return http::plain("403 Forbidden", "only the page that is served here may ask").into_bytes();
+    if let Some(refusal) = loopback::refusal(head, port) {
+        return refusal.into_bytes();
     }
     let (path, query) = head.target.split_once('?').unwrap_or((head.target, ""));
     match (head.method, path) {
-        ("GET", "/") => with_headers("text/html; charset=utf-8", "no-store", PAGE.as_bytes()),
-        ("GET", "/about") => with_headers("application/json", "no-store", desk.about().as_bytes()),
-        ("GET", "/columns") => with_headers("application/octet-stream", "no-store", &desk.columns()),
-        ("GET", "/answers") => with_headers("application/octet-stream", "no-store", &desk.answers()),
-        ("GET", "/suspicious") => with_headers("application/json", "no-store", desk.suspicious().as_bytes()),
-        ("GET", "/left-out") => with_headers("application/json", "no-store", desk.left_out_rows().as_bytes()),
+        ("GET", "/") => ok("text/html; charset=utf-8", PAGE.as_bytes()),
+        ("GET", "/about") => ok("application/json", desk.about().as_bytes()),
+        ("GET", "/columns") => ok("application/octet-stream", &desk.columns()),
+        ("GET", "/answers") => ok("application/octet-stream", &desk.answers()),
+        ("GET", "/suspicious") => ok("application/json", desk.suspicious().as_bytes()),
+        ("GET", "/left-out") => ok("application/json", desk.left_out_rows().as_bytes()),
         ("GET", "/picture") => picture(query, desk),
         ("POST", "/left-out") => leave_out(head, body, desk),
         ("GET" | "POST", _) => http::plain("404 Not Found", "there is one page here, /").into_bytes(),
@@ -96,13 +74,8 @@ fn answer(head: &Head, body: &[u8], port: u16, desk: &Desk) -> Vec<u8> {
     }
 }
 
-fn with_headers(content_type: &str, cache: &str, body: &[u8]) -> Vec<u8> {
-    let head = format!(
-        "HTTP/1.1 200 OK\r\nContent-Type: {content_type}\r\nContent-Length: {}\r\n{HEADERS}Cache-Control: {cache}\r\n\
-         Connection: close\r\n\r\n",
-        body.len()
-    );
-    [head.as_bytes(), body].concat()
+fn ok(content_type: &str, body: &[u8]) -> Vec<u8> {
+    http::response_of_bytes("200 OK", content_type, HEADERS, body)
 }
 
 /// `row=N&camera=centre`.
@@ -120,7 +93,7 @@ fn picture(query: &str, desk: &Desk) -> Vec<u8> {
         [0x89, b'P', b'N', b'G', ..] => "image/png",
         _ => return http::plain("404 Not Found", "there is no such picture, or it cannot be read").into_bytes(),
     };
-    with_headers(content_type, "no-store", &bytes)
+    ok(content_type, &bytes)
 }
 
 fn leave_out(head: &Head, body: &[u8], desk: &Desk) -> Vec<u8> {
@@ -133,7 +106,7 @@ fn leave_out(head: &Head, body: &[u8], desk: &Desk) -> Vec<u8> {
         return http::plain("400 Bad Request", "revision and stretches are needed").into_bytes();
     };
     match desk.leave_out(&wanted) {
-        Ok(told) => with_headers("application/json", "no-store", told.as_bytes()),
+        Ok(told) => ok("application/json", told.as_bytes()),
         Err(Refusal::Stale) => {
             http::plain("409 Conflict", "another page has changed the rows since: reload this one").into_bytes()
         }

@@ -80,9 +80,17 @@ pub(crate) fn plain(status: &str, sentence: &str) -> String {
 
 /// A whole response, after which the server closes the connection. `headers` are further headers, each with its line end.
 pub(crate) fn response(status: &str, content_type: &str, headers: &str, body: &str) -> String {
-    let len = body.len();
+    head_of_response(status, content_type, headers, body.len()) + body
+}
+
+/// As [`response`], for a body that is no text.
+pub(crate) fn response_of_bytes(status: &str, content_type: &str, headers: &str, body: &[u8]) -> Vec<u8> {
+    [head_of_response(status, content_type, headers, body.len()).as_bytes(), body].concat()
+}
+
+fn head_of_response(status: &str, content_type: &str, headers: &str, len: usize) -> String {
     format!(
-        "HTTP/1.1 {status}\r\nContent-Type: {content_type}\r\nContent-Length: {len}\r\n{headers}Connection: close\r\n\r\n{body}"
+        "HTTP/1.1 {status}\r\nContent-Type: {content_type}\r\nContent-Length: {len}\r\n{headers}Connection: close\r\n\r\n"
     )
 }
 

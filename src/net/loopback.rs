@@ -1,6 +1,6 @@
 //! What the servers of pages for this machine share: connections in threads, whole requests, and who may ask.
 
-use std::io::Read as _;
+use std::io::{Read as _, Write as _};
 use std::net::{Shutdown, TcpListener};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
@@ -16,6 +16,10 @@ const MAX_CONNECTIONS: usize = 32;
 const ROOM_PATIENCE: Duration = Duration::from_millis(100);
 /// Longest time for a whole request.
 pub(crate) const MAX_REQUEST_TIME: Duration = Duration::from_secs(5);
+/// Time that a browser has to read the last bytes.
+const FAREWELL: Duration = Duration::from_millis(300);
+/// Longest time that a read blocks.
+const TICK: Duration = Duration::from_millis(40);
 /// Pause between two checks of the listener.
 const LISTEN_PAUSE: Duration = Duration::from_millis(5);
 /// Stack of a connection's thread, bytes.
@@ -53,6 +57,40 @@ pub(crate) fn listen(
             }
         }
     });
+}
+
+/// Answers one request of a browser: `respond` is given the socket and the bytes that begin with the head of the request, and makes the
+/// response, or none if the client has gone.
+pub(crate) fn answer_request(
+    peer: &Peer,
+    over: &dyn Fn() -> bool,
+    respond: impl FnOnce(&mut Socket, Vec<u8>) -> std::io::Result<Option<Vec<u8>>>,
+) -> std::io::Result<()> {
+    let mut socket = Socket::new(peer.stream.try_clone()?, TICK)?;
+    let response = match read_request(&mut socket, over)? {
+        None => None,
+        Some(Request::Bad(response)) => Some(response.into_bytes()),
+        Some(Request::Head(bytes)) => respond(&mut socket, bytes)?,
+    };
+    if let Some(response) = response {
+        socket.write_all(&response)?;
+        socket.finish(FAREWELL);
+    }
+    Ok(())
+}
+
+/// The head of a request that [`answer_request`] has read.
+pub(crate) fn head(bytes: &[u8]) -> Head<'_> {
+    Head::parse(bytes).ok().flatten().expect("it was read as a whole request")
+}
+
+/// The response to a request that another site or another page makes; `None` to those of the page that is served at `port`.
+pub(crate) fn refusal(head: &Head, port: u16) -> Option<String> {
+    match own_host(head, port) {
+        Err(response) => Some(response),
+        Ok(host) if is_own_page(head, host) => None,
+        Ok(_) => Some(http::plain("403 Forbidden", "only the page that is served here may ask")),
+    }
 }
 
 /// What a client has sent.

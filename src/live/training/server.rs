@@ -1,13 +1,9 @@
 //! Answers the requests of the page.
 
-use std::io::Write as _;
-use std::time::Duration;
-
 use super::Desk;
 use crate::net::connections::Peer;
 use crate::net::http::{self, Head};
-use crate::net::loopback::{self, Request};
-use crate::net::socket::Socket;
+use crate::net::loopback;
 use crate::text::escaped;
 
 /// The whole page.
@@ -17,35 +13,18 @@ const HEADERS: &str = "Content-Security-Policy: default-src 'none'; script-src '
     img-src data:; connect-src 'self'; frame-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'self'\r\n\
     X-Frame-Options: SAMEORIGIN\r\nX-Content-Type-Options: nosniff\r\nReferrer-Policy: no-referrer\r\n\
     Cross-Origin-Resource-Policy: same-origin\r\nCache-Control: no-store\r\n";
-/// Time that a browser has to read the last bytes.
-const FAREWELL: Duration = Duration::from_millis(300);
-/// Longest time that a read blocks.
-const TICK: Duration = Duration::from_millis(40);
 
 /// Answers one request. An error ends the connection; there is no one to tell.
 pub(super) fn serve(peer: &Peer, port: u16, desk: &Desk) -> std::io::Result<()> {
-    let mut socket = Socket::new(peer.stream.try_clone()?, TICK)?;
-    let response = match loopback::read_request(&mut socket, &|| desk.is_over())? {
-        None => return Ok(()),
-        Some(Request::Bad(response)) => response,
-        Some(Request::Head(bytes)) => {
-            let head = Head::parse(&bytes).ok().flatten().expect("it was read as a whole request");
-            answer(&head, port, desk)
-        }
-    };
-    socket.write_all(response.as_bytes())?;
-    socket.finish(FAREWELL);
-    Ok(())
+    loopback::answer_request(peer, &|| desk.is_over(), |_, bytes| {
+        Ok(Some(answer(&loopback::head(&bytes), port, desk).into_bytes()))
+    })
 }
 
 /// The response to a request.
 fn answer(head: &Head, port: u16, desk: &Desk) -> String {
-    let host = match loopback::own_host(head, port) {
-        Ok(host) => host,
-        Err(response) => return response,
-    };
-    if !loopback::is_own_page(head, host) {
-        return http::plain("403 Forbidden", "only the page that is served here may ask");
+    if let Some(refusal) = loopback::refusal(head, port) {
+        return refusal;
     }
     let ok = |content_type: &str, body: &str| http::response("200 OK", content_type, HEADERS, body);
     let path = head.target.split('?').next().unwrap_or("");
