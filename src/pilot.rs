@@ -212,7 +212,8 @@ impl Pilot {
         let (network, parameters) = (self.predictor.network(), self.predictor.parameters());
         let plan = self.observation.get_or_insert_with(|| ObservationPlan::new(network));
         plan.run(network, parameters, &self.input, &mut self.outputs, seen);
-        // Layers that run as one may round otherwise.
+        // The network runs a second time, in its plan: layers that run as one round otherwise than one by one, so the answer of the
+        // first pass may differ in its last bits, and in its plan they never write what is between them, which is to be seen.
         self.run_network();
         Ok(self.outputs[0])
     }
