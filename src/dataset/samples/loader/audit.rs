@@ -21,9 +21,12 @@ impl Loader {
         self.thumbnails.iter().filter_map(OnceLock::get).flatten().collect()
     }
 
-    /// Whether the audit of near twins looks at the row of this image.
+    /// Whether the audit of near twins looks at the row of this image. Of a row that counts several times its first item decides,
+    /// whichever is decoded first.
     pub(super) fn is_compared(&self, image: u32) -> bool {
-        (self.images[image as usize].0 as usize).is_multiple_of(self.compared_every)
+        let item = self.images[image as usize].0 as usize;
+        let before = self.items[..item].iter().rev().take_while(|other| **other == self.items[item]).count();
+        (item - before).is_multiple_of(self.compared_every)
     }
 
     pub(super) fn thumbnail(&self, decoded: &RgbImage) -> Thumbnail {

@@ -61,3 +61,21 @@ fn of_a_long_side_the_audit_looks_at_one_row_in_several() {
     other.take_thumbnails(&training.thumbnails());
     assert_eq!(validation.near_twins(&other), twins);
 }
+
+#[test]
+fn whether_a_row_that_counts_several_times_is_looked_at_does_not_depend_on_which_is_decoded_first() {
+    let folder = tempfile::tempdir().unwrap();
+    let recordings = recordings(folder.path(), 150);
+    let mut split = divide(&recordings, &spec());
+    split.times = vec![3; split.training.len()];
+    for epoch in 0..4 {
+        let targets = targets(&recordings, &spec());
+        let mut loader = Loader::training(&recordings, &targets, &split, &spec()).unwrap();
+        loader.compared_every = 2;
+        loader.begin_epoch(epoch);
+        let mut batch = Batch::default();
+        (0..loader.batches()).for_each(|i| loader.fill(i, &mut batch).unwrap());
+        // The first items of the rows have the numbers 0, 3, 6, …
+        assert_eq!(loader.near_twins(&loader).frames, split.training.len().div_ceil(2));
+    }
+}
