@@ -11,26 +11,20 @@ preprocessing computes on its way: where both graphs agree with the engine, so d
 One line for each model and form; ends with 1 if a bound is broken.
 """
 
-import argparse
 import csv
-import json
 import pathlib
 import re
-import subprocess
-import sys
-import tempfile
 
 import numpy as np
 import onnx
 import onnxruntime
-from PIL import Image
+from exchange import answers, main, run
 
 # Largest difference of the outputs: from the preprocessed picture on; from the camera image on, on 99 % of the rows and on
 # all. Outputs beyond 1, as untrained models give, are compared in relative terms.
 NETWORK_BOUND = 1e-5
 IMAGE_BOUND_99 = 1e-5
 IMAGE_BOUND_ALL = 2e-3
-IMAGES_A_CALL = 500
 
 
 def center_images(recording, rows):
@@ -41,40 +35,8 @@ def center_images(recording, rows):
     return [path for path in paths if path.is_file()][:rows]
 
 
-def run(steersman, *args):
-    done = subprocess.run([steersman, *args], capture_output=True, text=True)
-    if done.returncode != 0:
-        sys.exit(f"steersman {' '.join(args[:3])} failed: {done.stderr}")
-    return done.stdout
-
-
-class Pictures:
-    """The pictures at a size, as PNG files and as an array."""
-
-    def __init__(self, paths, noise, folder):
-        self.paths, self.noise, self.folder, self.sizes = paths, noise, folder, {}
-
-    def of_size(self, height, width):
-        if (height, width) not in self.sizes:
-            folder = pathlib.Path(self.folder) / f"{height}x{width}"
-            folder.mkdir()
-            random = np.random.default_rng(1)
-            pixels = [np.asarray(Image.open(path).convert("RGB").resize((width, height))) for path in self.paths]
-            pixels += [random.integers(0, 256, (height, width, 3), np.uint8) for _ in range(self.noise)]
-            files = []
-            for index, picture in enumerate(pixels):
-                files.append(str(folder / f"{index}.png"))
-                Image.fromarray(picture).save(files[-1], compress_level=1)
-            self.sizes[height, width] = files, np.stack(pixels)
-        return self.sizes[height, width]
-
-
 def predictions(steersman, model, files, names):
-    answers = []
-    for start in range(0, len(files), IMAGES_A_CALL):
-        text = run(steersman, "predict", model, *files[start : start + IMAGES_A_CALL], "--json")
-        answers += [[answer[name] for name in names] for answer in json.loads(text.splitlines()[-1])]
-    return np.array(answers, np.float64)
+    return np.array([[answer[name] for name in names] for answer in answers(steersman, model, files)], np.float64)
 
 
 def export(steersman, model, folder, *flags):
@@ -136,20 +98,6 @@ def check(steersman, model, pictures, folder):
     return holds
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--steersman", required=True, help="the program")
-    parser.add_argument("--rows", type=int, default=None, help="at most so many rows of the recording")
-    parser.add_argument("--noise", type=int, default=20, help="pictures of noise")
-    parser.add_argument("recording", type=pathlib.Path)
-    parser.add_argument("models", nargs="+")
-    args = parser.parse_args()
-    print(f"onnx {onnx.__version__}, onnxruntime {onnxruntime.__version__}")
-    with tempfile.TemporaryDirectory() as folder:
-        pictures = Pictures(center_images(args.recording, args.rows), args.noise, folder)
-        holds = [check(args.steersman, model, pictures, folder) for model in args.models]
-    sys.exit(0 if all(holds) else 1)
-
-
 if __name__ == "__main__":
-    main()
+    print(f"onnx {onnx.__version__}, onnxruntime {onnxruntime.__version__}")
+    main(__doc__, center_images, check, "rows")

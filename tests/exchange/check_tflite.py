@@ -12,32 +12,21 @@ A model that gives no throttle is exported with the constant one of CONSTANT_THR
 bound is broken.
 """
 
-import argparse
 import json
 import pathlib
 import subprocess
-import sys
-import tempfile
 import time
 
 import numpy as np
 from donkeycar.parts.interpreter import TfLite
 from donkeycar.parts.keras import KerasLinear
-from PIL import Image
+from exchange import answers, main, run
 
 # Largest difference of an output, on 99 % of the pictures and on all; relative where the output is beyond 1, as untrained models
 # give. Pictures whose colours or sizes are changed may round a grey level the other way.
 BOUND = 1e-5
 BOUND_ALL_PREPROCESSED = 2e-3
 CONSTANT_THROTTLE = -0.375
-IMAGES_A_CALL = 500
-
-
-def run(steersman, *args):
-    done = subprocess.run([steersman, *args], capture_output=True, text=True)
-    if done.returncode != 0:
-        sys.exit(f"steersman {' '.join(args[:3])} failed: {done.stderr}")
-    return done.stdout
 
 
 def recorded(recording, rows):
@@ -52,38 +41,10 @@ def recorded(recording, rows):
     return [path for path in paths if path.is_file()][:rows]
 
 
-class Pictures:
-    """The pictures at a size, as PNG files and as arrays."""
-
-    def __init__(self, paths, noise, folder):
-        self.paths, self.noise, self.folder, self.sizes = paths, noise, folder, {}
-
-    def of_size(self, height, width):
-        if (height, width) not in self.sizes:
-            folder = pathlib.Path(self.folder) / f"{height}x{width}"
-            folder.mkdir()
-            random = np.random.default_rng(1)
-            pixels = []
-            for path in self.paths:
-                picture = Image.open(path).convert("RGB")
-                pixels.append(np.asarray(picture if picture.size == (width, height) else picture.resize((width, height))))
-            pixels += [random.integers(0, 256, (height, width, 3), np.uint8) for _ in range(self.noise)]
-            files = []
-            for index, picture in enumerate(pixels):
-                files.append(str(folder / f"{index}.png"))
-                Image.fromarray(picture).save(files[-1], compress_level=1)
-            self.sizes[height, width] = files, pixels
-        return self.sizes[height, width]
-
-
 def predictions(steersman, model, files):
-    answers = []
-    for start in range(0, len(files), IMAGES_A_CALL):
-        text = run(steersman, "predict", model, *files[start : start + IMAGES_A_CALL], "--json")
-        for answer in json.loads(text.splitlines()[-1]):
-            throttle = np.float32(answer.get("throttle", CONSTANT_THROTTLE))
-            answers.append([answer["steering"], throttle])
-    return np.array(answers, np.float64)
+    found = answers(steersman, model, files)
+    throttles = [np.float32(answer.get("throttle", CONSTANT_THROTTLE)) for answer in found]
+    return np.array([[answer["steering"], throttle] for answer, throttle in zip(found, throttles)], np.float64)
 
 
 def export(steersman, model, folder):
@@ -111,15 +72,15 @@ def check(steersman, model, pictures, folder):
     assert all(list(output["shape"]) == [1, 1] for output in interpreter.interpreter.get_output_details())
 
     expected = predictions(steersman, model, files)
-    seconds, answers = [], []
+    seconds, given = [], []
     for picture in pixels:
         start = time.perf_counter()
-        answers.append(pilot.run(picture))
+        given.append(pilot.run(picture))
         seconds.append(time.perf_counter() - start)
-    answers = np.array(answers, np.float64)
+    given = np.array(given, np.float64)
     apart = np.abs(expected[:, 0] - expected[:, 1]).max()
     assert apart > 1e-3, "steering and throttle that are alike do not show their order"
-    error = np.abs(answers - expected) / np.maximum(1.0, np.abs(expected))
+    error = np.abs(given - expected) / np.maximum(1.0, np.abs(expected))
     good = (np.quantile(error, 0.99, axis=0) <= BOUND).all() and error.max() <= BOUND_ALL_PREPROCESSED
     steering, throttle = error.max(axis=0)
     above = int((error.max(axis=1) > BOUND).sum())
@@ -131,19 +92,5 @@ def check(steersman, model, pictures, folder):
     return good
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--steersman", required=True, help="the program")
-    parser.add_argument("--rows", type=int, default=None, help="at most so many pictures of the recording")
-    parser.add_argument("--noise", type=int, default=20, help="pictures of noise")
-    parser.add_argument("recording", type=pathlib.Path)
-    parser.add_argument("models", nargs="+")
-    args = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        pictures = Pictures(recorded(args.recording, args.rows), args.noise, folder)
-        holds = [check(args.steersman, model, pictures, folder) for model in args.models]
-    sys.exit(0 if all(holds) else 1)
-
-
 if __name__ == "__main__":
-    main()
+    main(__doc__, recorded, check, "pictures")
