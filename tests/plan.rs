@@ -1,19 +1,21 @@
 //! What a planned network promises: no allocation in the steady state, the same bits for any number of threads and any
 //! capacity of the plan, and an evaluation that changes nothing.
 
-use std::sync::{Arc, Barrier, Mutex, PoisonError};
+use std::sync::{Mutex, PoisonError};
 
 use ndarray::{Array1, ArrayView1, ArrayView4, Axis};
+use planned::{NETWORKS, Setup, images};
 use steersman::engine::loss::{Loss, PairTerms, Pairs, Smoothness};
-use steersman::engine::network::{
-    InferencePlan, LayerSpec, Network, Parameters, Predictor, Ranks, StepInput, TrainingPlan, share,
-};
+use steersman::engine::network::{InferencePlan, LayerSpec, Network, Parameters, Predictor, StepInput, TrainingPlan};
 use steersman::engine::optimizer::{AveragingSpec, Optimizer, WeightAverage};
 use steersman::engine::random::{Purpose, rng, uniform};
 use steersman::engine::tensor::Shape;
 use steersman::recipe::Recipe;
+use steersman_kernels::Isa;
 use steersman_kernels::conv::ConvAlgorithm;
-use steersman_kernels::{Backend, Isa};
+
+#[path = "common/planned.rs"]
+mod planned;
 
 #[global_allocator]
 static ALLOCATOR: dhat::Alloc = dhat::Alloc;
@@ -21,29 +23,7 @@ static ALLOCATOR: dhat::Alloc = dhat::Alloc;
 /// Allocations are counted for the whole process: one test at a time.
 static ALONE: Mutex<()> = Mutex::new(());
 
-struct Setup {
-    recipe: Recipe,
-    network: Network,
-    x: Vec<f32>,
-    labels: Vec<f32>,
-}
-
 impl Setup {
-    fn new(recipe: &str, size: &str, images: usize) -> Setup {
-        Setup::with(recipe, size, images, ConvAlgorithm::Auto)
-    }
-
-    fn with(recipe: &str, size: &str, images: usize, conv: ConvAlgorithm) -> Setup {
-        let recipe = Recipe::find(recipe, &[format!("preprocessing.resize={size}")]).unwrap();
-        let network = recipe.network(Backend { isa: Isa::best(), conv }).unwrap();
-        let mut random = rng(1, Purpose::Test, 0, 0);
-        // Grey levels where the network scales them itself.
-        let (low, high) = if recipe.preprocessing.scale == 1.0 { (0.0, 255.0) } else { (-0.5, 0.5) };
-        let x = (0..images * network.input().len()).map(|_| uniform(&mut random, low, high) as f32).collect();
-        let labels = (0..images).map(|_| uniform(&mut random, -1.0, 1.0) as f32).collect();
-        Setup { recipe, network, x, labels }
-    }
-
     /// The same network with ELUs of `alpha` for its activations.
     fn with_elu(self, alpha: f32) -> Setup {
         let text = format!("{{ kind = 'elu', alpha = {alpha:?} }}");
@@ -62,10 +42,6 @@ impl Setup {
 
     fn images(&self) -> ArrayView4<'_, f32> {
         images(&self.network, &self.x)
-    }
-
-    fn optimizer(&self) -> Optimizer {
-        Optimizer::new(self.recipe.optimizer, Some(0.1), self.network.tensors(), self.network.isa())
     }
 
     fn step(&self, plan: &mut TrainingPlan, optimizer: &mut Optimizer, parameters: &mut Parameters) -> f64 {
@@ -88,13 +64,6 @@ impl Setup {
         })
     }
 }
-
-/// The images in `x` as an array.
-fn images<'a>(network: &Network, x: &'a [f32]) -> ArrayView4<'a, f32> {
-    ArrayView4::from_shape(network.input().batch(x.len() / network.input().len()), x).unwrap()
-}
-
-const NETWORKS: [(&str, &str); 3] = [("hyper", "[40, 44]"), ("lenet", "[30, 26]"), ("pilotnet", "[61, 65]")];
 
 /// Fewest blocks that `work` allocates in five goes: what the threads of the test harness allocate meanwhile counts too.
 fn allocations(mut work: impl FnMut()) -> u64 {
@@ -186,131 +155,6 @@ fn training_gives_the_same_bits_for_any_number_of_threads_and_any_capacity() {
     }
 }
 
-/// Ranks that are threads of this process: what they send lies on a table, for all to read between two meetings.
-#[derive(Debug)]
-struct ThreadRanks {
-    rank: usize,
-    table: Arc<Table>,
-}
-
-#[derive(Debug)]
-struct Table {
-    meeting: Barrier,
-    /// For each rank, what it sends to each rank.
-    sent: Vec<Mutex<Vec<Vec<f64>>>>,
-}
-
-impl ThreadRanks {
-    fn table(size: usize) -> Arc<Table> {
-        Arc::new(Table { meeting: Barrier::new(size), sent: (0..size).map(|_| Mutex::default()).collect() })
-    }
-
-    /// What each rank sends to this one, one after the other.
-    fn exchange(&self, send: Vec<Vec<f64>>, counts: &[usize]) -> Vec<f64> {
-        *self.table.sent[self.rank].lock().unwrap() = send;
-        self.table.meeting.wait();
-        let from = self.table.sent.iter().map(|sent| sent.lock().unwrap()[self.rank].clone());
-        let received: Vec<Vec<f64>> = from.collect();
-        self.table.meeting.wait();
-        assert_eq!(received.iter().map(Vec::len).collect::<Vec<_>>(), counts);
-        received.concat()
-    }
-}
-
-fn singles(doubles: Vec<f64>, to: &mut [f32]) {
-    to.copy_from_slice(&doubles.iter().map(|x| *x as f32).collect::<Vec<_>>());
-}
-
-impl Ranks for ThreadRanks {
-    fn rank(&self) -> usize {
-        self.rank
-    }
-
-    fn size(&self) -> usize {
-        self.table.sent.len()
-    }
-
-    fn gather_f64(&self, mine: &[f64], counts: &[usize], all: &mut [f64]) {
-        all.copy_from_slice(&self.exchange(vec![mine.to_vec(); self.size()], counts));
-    }
-
-    fn gather_f32(&self, mine: &[f32], counts: &[usize], all: &mut [f32]) {
-        let mine: Vec<f64> = mine.iter().copied().map(f64::from).collect();
-        singles(self.exchange(vec![mine; self.size()], counts), all);
-    }
-
-    fn exchange_f32(&self, send: &[f32], send_counts: &[usize], receive: &mut [f32], receive_counts: &[usize]) {
-        let mut rest = send;
-        let parts = send_counts.iter().map(|count| {
-            let (part, after) = rest.split_at(*count);
-            rest = after;
-            part.iter().copied().map(f64::from).collect()
-        });
-        singles(self.exchange(parts.collect(), receive_counts), receive);
-        assert!(rest.is_empty());
-    }
-}
-
-/// Losses and weights after two steps and a pass for statistics with `pairs`, on rank `rank` of those at `table`, or alone.
-fn share_of_training(
-    setup: &Setup,
-    images: usize,
-    pairs: &PairTerms,
-    place: Option<(usize, &Arc<Table>)>,
-) -> (Vec<f64>, Parameters) {
-    let plan = TrainingPlan::new(&setup.network, images);
-    let (mut plan, share) = match place {
-        None => (plan, 0..images),
-        Some((rank, table)) => {
-            let share = share(images, pairs.images() > 0, rank, table.sent.len());
-            (plan.with_ranks(Arc::new(ThreadRanks { rank, table: table.clone() })), share)
-        }
-    };
-    let len = setup.network.input().len();
-    let x = self::images(&setup.network, &setup.x[share.start * len..share.end * len]);
-    let labels = ArrayView1::from(&setup.labels[share]);
-    let (mut optimizer, mut parameters) = (setup.optimizer(), setup.network.initialize(1));
-    let (network, loss) = (&setup.network, &setup.recipe.loss);
-    let mut losses = Vec::new();
-    for step in 0..2 {
-        let input = || StepInput { x, labels, seed: 1, step };
-        losses.push(plan.step_of_share(network, &mut parameters, loss, pairs, input(), images));
-        let norm = plan.gradient_norm();
-        optimizer.step(1e-3, &mut parameters.values, plan.gradient_mut(), norm);
-        plan.pass_statistics(network, &mut parameters, pairs, input(), images);
-    }
-    (losses, parameters)
-}
-
-#[test]
-fn training_gives_the_same_bits_for_any_number_of_processes() {
-    let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
-    let smoothness = Smoothness { pairs_share: 0.5, spatial: 2.0, temporal: 3.0 };
-    let paired = PairTerms::new(&smoothness, Pairs { spatial: 5, temporal: 6 });
-    for (recipe, size) in NETWORKS {
-        for (images, pairs) in [(2, PairTerms::default()), (37, paired), (40, paired), (70, PairTerms::default())] {
-            let setup = Setup::new(recipe, size, images);
-            let pool = || rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
-            let alone = pool().install(|| share_of_training(&setup, images, &pairs, None));
-            for ranks in [1, 2, 3, 5] {
-                let table = ThreadRanks::table(ranks);
-                std::thread::scope(|scope| {
-                    let of_rank = |rank| {
-                        let (table, setup, pairs) = (&table, &setup, &pairs);
-                        scope.spawn(move || {
-                            pool().install(|| share_of_training(setup, images, pairs, Some((rank, table))))
-                        })
-                    };
-                    let threads: Vec<_> = (0..ranks).map(of_rank).collect();
-                    for (rank, thread) in threads.into_iter().enumerate() {
-                        assert!(thread.join().unwrap() == alone, "{recipe}, {images} images, rank {rank} of {ranks}");
-                    }
-                });
-            }
-        }
-    }
-}
-
 #[test]
 fn a_prediction_does_not_depend_on_the_other_images() {
     let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
@@ -368,7 +212,6 @@ fn a_network_can_learn_eight_images_by_heart() {
     }
 }
 
-/// Two networks of the same sizes, with another slope: all buffers would fit, so nothing but the plan itself can tell.
 /// A network with batch norm or without, whose loss is smooth: no dropout, no ReLU.
 fn smooth_network(batch_norm: bool) -> Network {
     let norm = if batch_norm { "{kind='batch_norm'}, " } else { "" };
@@ -453,6 +296,7 @@ fn a_pass_for_statistics_alone_moves_them_as_a_step_does_and_nothing_else() {
     }
 }
 
+/// Two networks of the same sizes, with another slope: all buffers would fit, so nothing but the plan itself can tell.
 #[test]
 #[should_panic(expected = "a training plan for another network")]
 fn a_training_plan_refuses_another_network_of_the_same_sizes() {

@@ -27,6 +27,24 @@ pub fn random_model(path: &Path, recipe: &str) {
     Model { recipe, parameters, record, training_rows: vec![] }.save(path).unwrap();
 }
 
+/// A folder with `model`, a small network with random weights.
+pub fn folder_with_model() -> tempfile::TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    random_model(&folder.path().join("model"), "lenet");
+    folder
+}
+
+/// A server at the speed of `drive`.
+pub fn serve(folder: &tempfile::TempDir, args: &[&str]) -> Served {
+    Served::start(folder.path(), "model", &[&["--speed", "20"], args].concat())
+}
+
+/// Drives `client` once: sends telemetry and wants a command.
+pub fn turn(client: &mut Client, speed: f64, jpeg: &[u8]) -> (f64, f64) {
+    client.send(&telemetry(speed, jpeg));
+    command(&client.next())
+}
+
 /// The program that Udacity's simulator says it is.
 pub const SIMULATOR: &str = "websocket-sharp/1.0";
 
