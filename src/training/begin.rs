@@ -8,11 +8,11 @@ use steersman_kernels::conv::ConvAlgorithm;
 
 use super::data::{Data, Sources};
 use super::profile::Profile;
-use super::request::{TrainRequest, TrainResult, TrainingEvent};
+use super::request::{TrainRequest, TrainResult, TrainingEvent, TransferRequest};
 use super::run::TrainingRun;
 use super::run_folder::{RunFolder, RunInfo};
 use super::together;
-use super::transfer::{Start, TransferRequest};
+use super::transfer::Start;
 use crate::dataset::held_out::held_out_tracks;
 use crate::error::{Error, Result};
 use crate::files::atomic_file;

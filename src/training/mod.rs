@@ -37,7 +37,6 @@ pub(crate) use data::Data;
 pub use history::{EpochRecord, read_history};
 pub use pace::{Pace, PaceNow};
 pub use profile::ProfileReport;
-pub use request::{DEFAULT_CACHE_MIB, TrainRequest, TrainResult, TrainingEvent};
+pub use request::{DEFAULT_CACHE_MIB, TrainRequest, TrainResult, TrainingEvent, TransferRequest};
 pub(crate) use run_folder::{NewRun, RunFolder, RunInfo};
 pub use together::take_part;
-pub use transfer::TransferRequest;

@@ -7,8 +7,8 @@ use steersman_kernels::conv::ConvAlgorithm;
 
 use super::history::EpochRecord;
 use super::profile::ProfileReport;
-use super::transfer::TransferRequest;
 use crate::dataset::Description;
+use crate::model_file::Transfer;
 use crate::recipe::Recipe;
 
 /// What to train on, and how.
@@ -39,6 +39,22 @@ pub struct TrainRequest {
     pub algorithm: Option<ConvAlgorithm>,
     /// Whether the result says where the time went.
     pub profile: bool,
+}
+
+/// The model to start from, and the layers to freeze.
+#[derive(Clone, Debug)]
+pub struct TransferRequest {
+    /// The model file.
+    pub model: PathBuf,
+    /// Layers to freeze.
+    pub freeze: Vec<String>,
+}
+
+impl TransferRequest {
+    /// The request that led to `transfer`.
+    pub(super) fn of(transfer: &Transfer) -> TransferRequest {
+        TransferRequest { model: PathBuf::from(&transfer.model), freeze: transfer.frozen.clone() }
+    }
 }
 
 /// Memory for decoded images unless another is asked for, MiB.

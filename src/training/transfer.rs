@@ -1,30 +1,15 @@
 //! Transfer: a run that starts from the weights of a model.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use steersman_kernels::Isa;
 
 use super::data::Data;
+use super::request::TransferRequest;
 use crate::engine::network::{Network, Parameters, Tensor};
 use crate::error::{Error, Result};
 use crate::model_file::{Model, Transfer};
 use crate::recipe::Recipe;
-
-/// The model to start from, and the layers to freeze.
-#[derive(Clone, Debug)]
-pub struct TransferRequest {
-    /// The model file.
-    pub model: PathBuf,
-    /// Layers to freeze.
-    pub freeze: Vec<String>,
-}
-
-impl TransferRequest {
-    /// The request that led to `transfer`.
-    pub(super) fn of(transfer: &Transfer) -> TransferRequest {
-        TransferRequest { model: PathBuf::from(&transfer.model), freeze: transfer.frozen.clone() }
-    }
-}
 
 /// The start of a run with transferred weights.
 #[derive(Debug)]

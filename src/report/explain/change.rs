@@ -165,6 +165,29 @@ fn each_pixel(out: &mut RgbImage, rgb: impl Fn(usize, usize) -> [u8; 3]) {
     }
 }
 
+/// What one change did, over all pictures. Angles are degrees of the front wheels.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Effect {
+    /// The change.
+    pub change: Change,
+    /// Mean distance that the angle moves.
+    pub mean_moved_deg: f64,
+    /// Its 95th percentile.
+    pub p95_moved_deg: f64,
+    /// Mean movement, + = to the right.
+    pub bias_deg: f64,
+    /// Share of the pictures in which it moves the right way, where one is right.
+    pub right_way_share: Option<f64>,
+    /// Mean absolute error after the change, where there are labels (negated for mirrored pictures).
+    pub mae_deg: Option<f64>,
+    /// Whether the model steers clearly better without what is masked.
+    pub helped: bool,
+    /// Whether the model passes; `None` where the change is for information.
+    pub passed: Option<bool>,
+    /// What that means.
+    pub verdict: String,
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

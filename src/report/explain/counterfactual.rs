@@ -4,7 +4,7 @@
 use rayon::prelude::*;
 use serde::Serialize;
 
-use super::change::{BONNET, Change, HORIZON};
+use super::change::{BONNET, Change, Effect, HORIZON};
 use super::findings::{Baseline, Finding, findings};
 use super::footage::{Footage, FootageBuffers};
 use crate::error::{Error, Result};
@@ -21,29 +21,6 @@ const MUCH: f64 = 0.5;
 const MOSTLY: f64 = 0.8;
 /// A mask helps a model whose error falls below this share of the error without the mask.
 const HELPED: f64 = 0.9;
-
-/// What one change did, over all pictures. Angles are degrees of the front wheels.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Effect {
-    /// The change.
-    pub change: Change,
-    /// Mean distance that the angle moves.
-    pub mean_moved_deg: f64,
-    /// Its 95th percentile.
-    pub p95_moved_deg: f64,
-    /// Mean movement, + = to the right.
-    pub bias_deg: f64,
-    /// Share of the pictures in which it moves the right way, where one is right.
-    pub right_way_share: Option<f64>,
-    /// Mean absolute error after the change, where there are labels (negated for mirrored pictures).
-    pub mae_deg: Option<f64>,
-    /// Whether the model steers clearly better without what is masked.
-    pub helped: bool,
-    /// Whether the model passes; `None` where the change is for information.
-    pub passed: Option<bool>,
-    /// What that means.
-    pub verdict: String,
-}
 
 /// The effects of all changes on a model.
 #[derive(Clone, Debug, PartialEq, Serialize)]

@@ -3,8 +3,7 @@
 
 use serde::Serialize;
 
-use super::change::{BONNET, BRIGHTER, Change, DARKER, HORIZON};
-use super::counterfactual::Effect;
+use super::change::{BONNET, BRIGHTER, Change, DARKER, Effect, HORIZON};
 use crate::dataset::Flip;
 use crate::recipe::Recipe;
 use crate::report::tone::Tone;
