@@ -28,7 +28,8 @@ pub struct Allowed {
 ///
 /// # Errors
 ///
-/// [`Error::Usage`] for held-out tracks and for a share that cannot be; as [`simulator_set`].
+/// [`Error::Usage`] for held-out tracks, for a share that cannot be, and with the simulator's set for recordings of different cameras or
+/// of one that the simulator cannot have; as [`training_set`](fn@training_set) and [`dataset::load_with`].
 pub fn beside_recordings(
     recipe: &mut Recipe,
     [training, validation]: [&[PathBuf]; 2],
