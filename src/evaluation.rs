@@ -1,17 +1,23 @@
 //! A model against recordings: what it answers for the centre picture of every usable row, beside what was recorded.
 
+mod answers;
+
 use std::path::PathBuf;
 use std::sync::{Mutex, PoisonError};
 
-use rayon::prelude::*;
+#[cfg(feature = "mpi")]
+pub(crate) use answers::Answers;
+#[cfg(not(feature = "mpi"))]
+use answers::Answers;
+use answers::{Answered, Pictures, TASK_PICTURES};
 use serde::Serialize;
 
+use crate::cluster::tasks::run;
 use crate::dataset::{self, Description, DrivenSessions, ImageCheck, OutputKind, OutputSpec, Outputs, Recording, View};
 use crate::error::{Error, Result};
 use crate::geometry::LookAhead;
 use crate::metrics::{Metrics, OutputMetrics, Prediction};
 use crate::observer::{Observer, Progress};
-use crate::picture::decode::MAX_SIDE;
 use crate::pilot::{Answer, Pilot};
 
 /// How far ahead the driven path is aimed at, s, unless told otherwise.
@@ -226,18 +232,30 @@ impl Teller<'_> {
 
 /// The answers for the centre pictures of all rows, each with its row; rows whose picture cannot be decoded are left out.
 fn answers(pilot: &Pilot, recording: &Recording, tell: &Teller) -> Result<Vec<(usize, Answer)>> {
-    let answer_row = |pilot: &mut Pilot, row: usize| {
+    let rows = |number: usize| {
+        let first = number * TASK_PICTURES;
+        first..recording.rows.len().min(first + TASK_PICTURES)
+    };
+    let picture = |row: usize| {
         let mut bytes = Vec::new();
         let read = recording.read_picture(row, View::Centre, &mut bytes);
-        let place = || recording.image_path(row, View::Centre).unwrap_or_default();
-        let named = |error: Error| Error::data(place(), error.to_string());
-        let answer = read.and_then(|()| pilot.answer_encoded_within(&bytes, MAX_SIDE).map_err(named));
-        tell.row(answer.as_ref().err().map(Error::to_string))?;
-        Ok(answer.ok().map(|answer| (row, answer)))
+        let place = recording.image_path(row, View::Centre).unwrap_or_default().display().to_string();
+        (place, read.map(|()| bytes).map_err(|error| error.to_string()))
     };
-    let rows = (0..recording.rows.len()).into_par_iter();
-    let answers: Vec<Option<(usize, Answer)>> = rows.map_init(|| pilot.clone(), answer_row).collect::<Result<_>>()?;
-    Ok(answers.into_iter().flatten().collect())
+    let all = Mutex::new(Vec::with_capacity(recording.rows.len()));
+    let keep = |number: usize, answered: Answered| {
+        for (row, answer) in rows(number).zip(answered.0) {
+            tell.row(answer.as_ref().err().cloned())?;
+            all.lock().unwrap_or_else(PoisonError::into_inner).extend(answer.ok().map(|answer| (row, answer)));
+        }
+        Ok(())
+    };
+    let count = recording.rows.len().div_ceil(TASK_PICTURES);
+    let task = |number: usize| Ok(Pictures(rows(number).map(picture).collect()));
+    run(&Answers(pilot.clone()), count, task, keep).ended?;
+    let mut all = all.into_inner().unwrap_or_else(PoisonError::into_inner);
+    all.sort_unstable_by_key(|(row, _)| *row);
+    Ok(all)
 }
 
 /// Full lock is 1. Models of a steering beyond 1 exist, as labels of cars do, but hardly one beyond this.

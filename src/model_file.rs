@@ -97,6 +97,11 @@ impl Model {
     ///
     /// [`Error::Io`], and [`Error::Network`] if the recipe does not fit the parameters.
     pub fn save(&self, path: &Path) -> Result<()> {
+        atomic_file::write(path, &self.to_file(path)?)
+    }
+
+    /// The bytes of the file `path`, as [`save`](Model::save) writes it.
+    pub(crate) fn to_file(&self, path: &Path) -> Result<Vec<u8>> {
         let network = self.recipe.network(Isa::PORTABLE)?;
         let metadata = Metadata {
             format: FORMAT,
@@ -113,7 +118,7 @@ impl Model {
             shape: vec![self.training_rows.len()],
             bytes: rows,
         });
-        write_tensors(path, &tensors, metadata)
+        tensor_bytes(path, &tensors, metadata)
     }
 
     /// Reads a model.
@@ -123,8 +128,12 @@ impl Model {
     /// [`Error::Io`] if the file cannot be read; [`Error::Data`] if it is damaged, has been made by something else, or its
     /// tensors do not fit its recipe.
     pub fn load(path: &Path) -> Result<Model> {
-        let bytes = read_file(path)?;
-        let (tensors, metadata) = read_tensors(path, &bytes)?;
+        Model::of_file(path, &read_file(path)?)
+    }
+
+    /// The model of the file `path` with these bytes.
+    pub(crate) fn of_file(path: &Path, bytes: &[u8]) -> Result<Model> {
+        let (tensors, metadata) = read_tensors(path, bytes)?;
         let version: FormatNumber = parse_metadata(path, &metadata)?;
         if version.format != FORMAT {
             let message = format!("is a model of format {}; this program reads format {FORMAT}", version.format);
@@ -194,11 +203,6 @@ pub(crate) fn tensors_of(network: &Network, parameters: &Parameters) -> Vec<Stor
         bytes: f32_bytes(parameters.tensor(tensor)),
     };
     network.tensors().iter().map(stored).collect()
-}
-
-/// Writes a safetensors file, in whole or not at all.
-pub(crate) fn write_tensors(path: &Path, tensors: &[StoredTensor], metadata: String) -> Result<()> {
-    atomic_file::write(path, &tensor_bytes(path, tensors, metadata)?)
 }
 
 /// The bytes of a safetensors file `path` of ours.
@@ -427,7 +431,7 @@ mod tests {
         assert!(load().contains("tensor `conv1.weight` has NaN at place 40"));
 
         let metadata = r#"{"format": 99}"#.to_string();
-        write_tensors(&path, &[], metadata).unwrap();
+        std::fs::write(&path, tensor_bytes(&path, &[], metadata).unwrap()).unwrap();
         assert!(load().contains("is a model of format 99; this program reads format 1"));
     }
 

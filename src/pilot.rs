@@ -7,12 +7,13 @@ use ndarray::{Array1, Array2, ArrayView3, ArrayView4, ArrayViewD, ArrayViewMut1,
 use rayon::prelude::*;
 use steersman_kernels::Isa;
 
+use crate::cluster::message::Message;
 use crate::dataset::OutputKind;
 use crate::dataset::preprocess::Preprocessor;
 use crate::engine::network::{Network, ObservationPlan, Parameters, Predictor};
 use crate::error::{Error, Result};
 use crate::files::limits::read_up_to;
-use crate::model_file::Model;
+use crate::model_file::{Model, TrainingRecord};
 use crate::picture::{
     RgbImage,
     decode::{MAX_FILE_LEN, MAX_SIDE, decode_rgb_within},
@@ -297,12 +298,28 @@ impl Pilot {
     }
 }
 
+/// As a model file, which knows of the training only the held-out tracks.
+impl Message for Pilot {
+    fn to_bytes(&self) -> Result<Vec<u8>> {
+        let record =
+            TrainingRecord { trained_on_held_out: self.trained_on_held_out().to_vec(), ..TrainingRecord::default() };
+        let (recipe, parameters) = (self.recipe().clone(), self.parameters().clone());
+        Model { recipe, parameters, record, training_rows: Vec::new() }.to_file(Path::new(OF_RANK_0))
+    }
+
+    fn of_bytes(bytes: &[u8]) -> Result<Pilot> {
+        Pilot::new(Model::of_file(Path::new(OF_RANK_0), bytes)?, Isa::best())
+    }
+}
+
+/// What errors call a model that another rank sent.
+const OF_RANK_0: &str = "the model of rank 0";
+
 #[cfg(test)]
 mod tests {
     use ndarray::{Array3, Array4};
 
     use super::*;
-    use crate::model_file::TrainingRecord;
 
     fn pilot(name: &str) -> Pilot {
         let recipe = Recipe::find(name, &[]).unwrap();
@@ -321,6 +338,16 @@ mod tests {
             assert!(pilot.steer(small.view()).unwrap().is_finite());
             assert_eq!(pilot.steer(usual.view()).unwrap(), first, "{name}: an image must not depend on earlier ones");
         }
+    }
+
+    #[test]
+    fn a_pilot_that_is_sent_steers_as_before() {
+        let picture = Array3::from_shape_fn((160, 320, 3), |(y, x, c)| ((y * 41 + x * 17 + c * 7) % 251) as u8);
+        let mut pilot = pilot("hyper");
+        let mut sent = Pilot::of_bytes(&pilot.to_bytes().unwrap()).unwrap();
+        assert_eq!(sent.steer(picture.view()).unwrap(), pilot.steer(picture.view()).unwrap());
+        assert_eq!(sent.recipe(), pilot.recipe());
+        assert!(Pilot::of_bytes(b"nonsense").unwrap_err().to_string().contains("rank 0"));
     }
 
     #[test]

@@ -6,10 +6,10 @@
 use std::path::Path;
 
 use steersman::Error;
+use steersman::main_job::TrackResult;
 use steersman::main_job::experiment::{self, ExperimentEvent, ExperimentPlan, Subject, write_csv};
-use steersman::main_job::job::{Job, JobEvent, JobNote, JobRequest, Scope};
+use steersman::main_job::job::{Job, JobEvent, JobNote, JobRequest, Scope, test_on_tracks};
 use steersman::main_job::training_set::{Take, recordings};
-use steersman::main_job::{TrackResult, test_on_track};
 use steersman::observer::{StopSignal, Unobserved};
 use steersman::pilot::Pilot;
 use steersman::recipe::Recipe;
@@ -29,7 +29,8 @@ fn learn(folder: &Path, threads: usize) -> (TrainResult, TrackResult) {
         let result = train(request, &mut Unobserved, &StopSignal::default()).unwrap();
         let pilot = Pilot::load(&result.model).unwrap();
         let options = DriveOptions { runs: 4, ..Default::default() };
-        let on_track = test_on_track(&pilot, &Track::load("lake").unwrap(), &options, None, &mut Unobserved).unwrap();
+        let never = StopSignal::default();
+        let on_track = test_on_tracks(&pilot, &["lake"], &options, None, &mut Unobserved, &never).unwrap().remove(0);
         (result, on_track)
     })
 }

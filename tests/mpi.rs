@@ -1,5 +1,5 @@
-//! Several ranks of MPI work as one process does: the same weights for any number of them, also after one was killed. Skipped where
-//! there is no `mpirun` of Open MPI.
+//! Several ranks of MPI work as one process does: the same weights, drives and recordings for any number of them, also after one was
+//! killed. Skipped where there is no `mpirun` of Open MPI.
 
 mod common;
 
@@ -69,9 +69,13 @@ const SAME: [&str; 7] =
 
 fn log(folder: &Path) {
     painted_log::write(&folder.join("log"), 160, "");
+    spoil(folder, "left");
+}
+
+/// Spoils a picture of `camera` so that only decoding finds out: it is complete at both ends.
+fn spoil(folder: &Path, camera: &str) {
     let images: Vec<_> = fs::read_dir(folder.join("log/IMG")).unwrap().map(|entry| entry.unwrap().path()).collect();
-    let spoilt = images.iter().filter(|path| path.to_string_lossy().contains("left")).nth(7).unwrap();
-    // Complete at both ends, so only decoding finds out.
+    let spoilt = images.iter().filter(|path| path.to_string_lossy().contains(camera)).nth(7).unwrap();
     let mut bytes = fs::read(spoilt).unwrap();
     let middle = bytes.len() / 3;
     bytes[20..middle].fill(0xff);
@@ -99,8 +103,33 @@ fn any_number_of_ranks_trains_the_weights_of_one_process() {
     }
 }
 
+/// A run of two ranks that has saved something; the launcher gives them `patience` seconds to end after a signal.
+fn begun(folder: &Path, args: &[&str], out: &str, patience: &str) -> Child {
+    let mut job = mpirun(folder, 2);
+    let job = job.args(["--mca", "odls_base_sigkill_timeout", patience]);
+    let job = job.arg(env!("CARGO_BIN_EXE_steersman")).args(args).args(["--out", out]);
+    let job = job.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+    let deadline = Instant::now() + Duration::from_secs(120);
+    while !folder.join(out).join("checkpoint.safetensors").exists() {
+        assert!(Instant::now() < deadline, "no checkpoint");
+        sleep(Duration::from_millis(5));
+    }
+    job
+}
+
+/// What `job` says after process `to` has had `signal`; it must end with an error, and soon.
+fn signalled(job: Child, signal: &str, to: u32) -> String {
+    let sent = Instant::now();
+    assert!(Command::new("kill").args([signal, &to.to_string()]).status().unwrap().success());
+    let output = job.wait_with_output().unwrap();
+    assert!(sent.elapsed() < Duration::from_secs(20), "it ended after {:?}", sent.elapsed());
+    let error = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(!output.status.success() && !error.contains("panicked"), "{error}");
+    error
+}
+
 #[test]
-fn ranks_end_soon_after_one_is_killed_and_any_number_of_them_goes_on() {
+fn ranks_end_soon_after_one_is_killed_or_all_are_interrupted_and_any_number_of_them_goes_on() {
     if !is_here() {
         return;
     }
@@ -108,33 +137,25 @@ fn ranks_end_soon_after_one_is_killed_and_any_number_of_them_goes_on() {
     log(folder.path());
     let args = [&ARGS[..], &["--set", "epochs=12"]].concat();
     let alone = json(folder.path(), &[&args[..], &["--out", "alone"]].concat());
-    let program = env!("CARGO_BIN_EXE_steersman");
-    let mut job = mpirun(folder.path(), 2);
-    let mut job = job.arg(program).args(&args).args(["--out", "killed"]);
-    job = job.stdout(Stdio::null()).stderr(Stdio::piped());
-    let job = job.spawn().unwrap();
-    let deadline = Instant::now() + Duration::from_secs(120);
-    while !folder.path().join("killed/checkpoint.safetensors").exists() {
-        assert!(Instant::now() < deadline, "no checkpoint");
-        sleep(Duration::from_millis(5));
-    }
+    let resumed = |out: &str, ranks: usize| {
+        let resumed = json_of_ranks(folder.path(), ranks, &["train", "--resume", out, "--threads", "1", "--json"]);
+        assert_eq!(resumed["weights_hash"], alone["weights_hash"], "{out}, {ranks} ranks");
+        assert_eq!(resumed["val_mse"], alone["val_mse"], "{out}, {ranks} ranks");
+    };
+    let job = begun(folder.path(), &args, "killed", "1");
     let ranks = children(&job);
     assert_eq!(ranks.len(), 2, "{ranks:?}");
-    let killed = Instant::now();
-    let status = Command::new("kill").args(["-9", &ranks[1].to_string()]).status().unwrap();
-    assert!(status.success());
-    let output = job.wait_with_output().unwrap();
-    assert!(killed.elapsed() < Duration::from_secs(10), "it ended after {:?}", killed.elapsed());
-    let error = String::from_utf8_lossy(&output.stderr);
-    assert!(!output.status.success() && error.contains("signal 9"), "{error}");
-    fs::rename(folder.path().join("killed"), folder.path().join("whole")).unwrap();
-    for ranks in [1, 3] {
-        let out = format!("resumed-{ranks}");
-        run_copy(folder.path(), "whole", &out);
-        let resumed = json_of_ranks(folder.path(), ranks, &["train", "--resume", &out, "--threads", "1", "--json"]);
-        assert_eq!(resumed["weights_hash"], alone["weights_hash"], "{ranks} ranks");
-        assert_eq!(resumed["val_mse"], alone["val_mse"], "{ranks} ranks");
-    }
+    let error = signalled(job, "-9", ranks[1]);
+    assert!(error.contains("signal 9"), "{error}");
+    run_copy(folder.path(), "killed", "killed-too");
+    resumed("killed", 1);
+    resumed("killed-too", 3);
+    // Ctrl-C in the terminal. A second, as the launcher gives by itself, is not enough on a busy machine.
+    let job = begun(folder.path(), &args, "interrupted", "5");
+    let launcher = job.id();
+    let error = signalled(job, "-INT", launcher);
+    assert!(error.contains("stopped and saved; go on with: steersman train --resume interrupted"), "{error}");
+    resumed("interrupted", 2);
 }
 
 fn run_copy(folder: &Path, from: &str, to: &str) {
@@ -153,36 +174,103 @@ fn children(job: &Child) -> Vec<u32> {
 }
 
 /// All but the speed of the simulation, which is measured.
+fn without_speed(value: &mut Value) {
+    match value {
+        Value::Object(entries) => {
+            if let Some(speed) = entries.remove("realtime_factor") {
+                assert!(speed.as_f64().unwrap() > 0.0);
+            }
+            entries.values_mut().for_each(without_speed);
+        }
+        Value::Array(items) => items.iter_mut().for_each(without_speed),
+        _ => {}
+    }
+}
+
+/// Compares all files below two folders, byte for byte but for speeds in JSON. Their number.
+fn same_files(one: &Path, other: &Path) -> usize {
+    let entries = |folder: &Path| {
+        let mut names: Vec<_> = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+        names.sort();
+        names
+    };
+    assert_eq!(entries(one), entries(other), "{}", one.display());
+    let same = |name: &std::ffi::OsString| {
+        let [one, other] = [one, other].map(|folder| folder.join(name));
+        if one.is_dir() {
+            return same_files(&one, &other);
+        }
+        let [mut a, mut b] = [&one, &other].map(|path| fs::read(path).unwrap());
+        if one.extension().is_some_and(|extension| extension == "json") {
+            [&mut a, &mut b].into_iter().for_each(|bytes| {
+                let mut value = serde_json::from_slice(bytes).unwrap();
+                without_speed(&mut value);
+                *bytes = value.to_string().into_bytes();
+            });
+        }
+        assert!(a == b, "{} and {}", one.display(), other.display());
+        1
+    };
+    entries(one).iter().map(same).sum()
+}
+
+/// Runs the same in one process and on these numbers of ranks, with `--out` and a name of its own; what is printed and what is written must be the
+/// same. The number of files.
+fn same_on(ranks: &[usize], folder: &Path, args: &[&str]) -> usize {
+    let name = args[..2].join("-").replace(['/', '.'], "-");
+    let mut files = 0;
+    let mut alone = json(folder, &[args, &["--out", &format!("{name}-alone")]].concat());
+    without_speed(&mut alone);
+    for ranks in ranks {
+        let out = format!("{name}-{ranks}");
+        let mut together = json_of_ranks(folder, *ranks, &[args, &["--out", &out]].concat());
+        without_speed(&mut together);
+        assert_eq!(together, alone, "{ranks} ranks, {args:?}");
+        let [one, other] = ["alone", &ranks.to_string()].map(|run| folder.join(format!("{name}-{run}")));
+        files = match one.is_dir() {
+            true => same_files(&one, &other),
+            false => {
+                assert!(fs::read(&one).unwrap() == fs::read(&other).unwrap(), "{ranks} ranks, {args:?}");
+                1
+            }
+        };
+    }
+    files
+}
+
 #[test]
-fn seeds_that_ranks_drive_come_to_the_same_bytes() {
+fn what_is_many_is_the_same_for_any_number_of_ranks() {
     if !is_here() {
         return;
     }
     let folder = tempfile::tempdir().unwrap();
-    let args = ["drive", "zero", "--track", "lake", "--runs", "6", "--against", "expert", "--json", "--out"];
-    let alone = json(folder.path(), &[&args[..], &["alone"]].concat());
-    let together = json_of_ranks(folder.path(), 3, &[&args[..], &["together"]].concat());
-    let without_speed = |mut value: Value| {
-        for drive in [value.clone(), value["against"].clone()] {
-            assert!(drive["realtime_factor"].as_f64().unwrap() > 0.0);
-        }
-        value.as_object_mut().unwrap().remove("realtime_factor");
-        value["against"].as_object_mut().unwrap().remove("realtime_factor");
-        value
-    };
-    assert_eq!(without_speed(together), without_speed(alone));
-    let mut compared = 0;
-    for entry in fs::read_dir(folder.path().join("alone")).unwrap() {
-        let path = entry.unwrap().path();
-        // It is what was printed.
-        if path.ends_with("summary.json") {
-            continue;
-        }
-        let other = folder.path().join("together").join(path.file_name().unwrap());
-        assert!(fs::read(&path).unwrap() == fs::read(&other).unwrap(), "{}", path.display());
-        compared += 1;
+    let folder = folder.path();
+    log(folder);
+    let model = "run/model.safetensors";
+    let small = ["--recipe", "lenet", "--set", "epochs=1", "--set", "batch=54", "--threads", "1"];
+    run(folder, &[&["train", "log"], &small[..], &["--out", "run"]].concat());
+
+    let expert = ["drive", "zero", "--track", "lake", "--runs", "6", "--against", "expert", "--json"];
+    // Of each run two trajectories; the map, and the summary.
+    assert!(same_on(&[2, 4], folder, &expert) >= 12);
+    let swept = ["drive", "expert", "--track", "lake", "--latency-ms", "0,150", "--noise=0.1", "--runs", "2", "--json"];
+    assert!(same_on(&[2, 4], folder, &swept) >= 10);
+    let recording = ["record", "--track=lake", "--laps", "0.15", "--recovery", "--camera", "udacity", "--json"];
+    assert!(same_on(&[2, 4], folder, &recording) > 300);
+    // Models drive here, which takes its time.
+    let experiment = ["experiment", "split", "--quick", "--recording", "log", "--track", "lake", "--json"];
+    assert_eq!(same_on(&[3], folder, &[&experiment[..], &small].concat()), 1);
+
+    spoil(folder, "center");
+    let judged = ["evaluate", model, "log", "log", "--json"];
+    let alone = run(folder, &judged);
+    let left_out = |output: &Output| String::from_utf8_lossy(&output.stderr).matches("left out: ").count();
+    assert_eq!(left_out(&alone), 2);
+    for ranks in [2, 4] {
+        let together = of_ranks(folder, ranks, &judged);
+        assert!(together.status.success() && together.stdout == alone.stdout, "{ranks} ranks");
+        assert_eq!(left_out(&together), left_out(&alone));
     }
-    assert!(compared >= 6, "{compared}");
 }
 
 /// What one rank finds wrong must not leave the others waiting.

@@ -13,6 +13,7 @@ use steersman_kernels::{Backend, Isa};
 use super::arguments::RecipeArgs;
 use super::process::pool;
 use super::terminal::print_json;
+use crate::cluster::process::peak_memory_mb;
 use crate::engine::network::{InferencePlan, Network, Parameters, Predictor, StageTime, StepInput, TrainingPlan};
 use crate::engine::optimizer::Optimizer;
 use crate::engine::random::{Purpose, rng, uniform};
@@ -190,7 +191,7 @@ fn measure(recipe: &Recipe, args: &BenchArgs, started: Instant) -> Result<BenchR
         infer_images_per_second,
         peak_gflops: peaks.iter().sum(),
         first_step_s,
-        peak_rss_mb: peak_rss_mb(),
+        peak_rss_mb: peak_memory_mb(),
         isa: network.isa().name(),
         algorithm: conv.name(),
         threads: rayon::current_num_threads(),
@@ -286,12 +287,4 @@ fn infer_latency(network: Network, parameters: Parameters, x: &[f32], seconds: f
     times.sort_by(f64::total_cmp);
     let percentile = |p: usize| times[(times.len() - 1) * p / 100];
     (percentile(50), percentile(99))
-}
-
-/// Largest resident memory of this process so far, in millions of bytes, where the system tells (Linux).
-fn peak_rss_mb() -> Option<f64> {
-    let status = std::fs::read_to_string("/proc/self/status").ok()?;
-    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
-    let kibibytes: f64 = line.trim().trim_end_matches("kB").trim().parse().ok()?;
-    Some(kibibytes * 1024.0 / 1e6)
 }

@@ -17,6 +17,8 @@ mod explain;
 pub(crate) mod export;
 mod import;
 mod inspect;
+#[cfg(feature = "mpi")]
+mod other_rank;
 mod predict;
 mod process;
 mod record;
@@ -27,8 +29,6 @@ pub(crate) mod summary;
 mod tracks;
 mod train;
 mod video;
-#[cfg(feature = "mpi")]
-mod worker;
 
 use std::process::ExitCode;
 use std::time::Instant;
@@ -123,7 +123,7 @@ enum Command {
 /// Runs the command line of this process. Among the ranks of an MPI job only rank 0 reads it; the others do what it tells them.
 pub fn main() -> ExitCode {
     #[cfg(feature = "mpi")]
-    return crate::cluster::mpi::run(command, worker::run, |text| eprintln!("{text}"));
+    return crate::cluster::mpi::run(command, other_rank::run, |text| eprintln!("{text}"));
     #[cfg(not(feature = "mpi"))]
     match crate::cluster::require_alone() {
         Ok(()) => command(),

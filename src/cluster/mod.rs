@@ -1,7 +1,7 @@
 //! Several processes, on one machine or many, that do the work of one.
 //!
 //! `mpirun -n 4 steersman train …` starts four processes of the same program: the ranks. Rank 0 runs the command as ever: it alone reads
-//! the arguments, writes, prints and saves. The others wait for its [orders](Order) and carry them out: see the worker of the command line.
+//! the arguments, writes, prints and saves. The others wait for its [orders](Order) and carry them out.
 //! In a training all ranks go through the same steps, each with its share of every batch, and have the same weights after each.
 //!
 //! # What goes over the wire
@@ -16,7 +16,25 @@
 //!
 //! Another `N` has up to a few subtrees a rank, and the first slices of the gradient go out once for each of them. The notice at the end of a
 //! training says what was counted. Nothing is sent while the backward pass goes on: the gradient is complete only at its end in networks
-//! without batch norm, and its slices are small beside the time of a step.
+//! without batch norm, and its slices are small beside the time of a step. The same notice says which share of the time of its steps each rank
+//! spent where all meet; for the rank that waits least this is about what overlapping could save at most.
+//!
+//! # What else is shared out
+//!
+//! Work that consists of many [tasks] goes to whoever is free, task by task: drives, the pictures of recordings, answers to pictures. Rank 0
+//! sends what all tasks have in common (a model, tracks) once, then the tasks, and writes what comes back.
+//!
+//! # How training scales
+//!
+//! On `N` machines of `c` cores a step on `B` images in `S` shards (of 8 images, but 16 to 64 shards) takes about
+//!
+//! ```text
+//! ceil(ceil(S / N) / c) · B / S · a  +  B · d / (N · c)  +  u  +  m · (N − 1) · l  +  v / w
+//! ```
+//!
+//! with CPU time `a` for an image forward and backward and `d` to load it, `u` for the update of all weights, `m` meetings (two for each batch-norm
+//! layer, and four), latency `l`, and `v` bytes sent (see above) at `w` bytes a second. `train --profile` gives `a`, `d` and `u`, and the notice
+//! at the end `v` and the time for meetings. A batch keeps at most `S` cores busy, so many cores want large batches.
 //!
 //! # Cores and memory
 //!
@@ -27,16 +45,19 @@
 //!
 //! With the feature `mpi` the ranks are those of MPI (see the module `mpi`); without it there is but this process.
 
+pub mod message;
 #[cfg(feature = "mpi")]
 pub mod mpi;
+pub mod process;
 pub mod tasks;
+#[cfg(test)]
+mod testing;
 
-use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, OnceLock};
+use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
-use sha2::{Digest, Sha256};
 
 use crate::engine::network::Ranks;
 use crate::error::{Error, Result};
@@ -57,6 +78,9 @@ pub trait Team: Ranks {
 
     /// Bytes that this rank has sent to others so far.
     fn sent_bytes(&self) -> u64;
+
+    /// Time that this rank has spent so far where all ranks meet: waiting for the others, and for what is on its way.
+    fn met(&self) -> Duration;
 }
 
 static TEAM: OnceLock<Arc<dyn Team>> = OnceLock::new();
@@ -81,15 +105,18 @@ impl Claim {
         &self.team
     }
 
-    /// Tells the other ranks what to do.
+    /// Tells the other ranks what to do, and sends them what belongs to it.
     ///
     /// # Errors
     ///
     /// [`Error::Fault`] if the order cannot be written.
-    pub fn order(&self, order: &Order) -> Result<()> {
+    pub fn order(&self, order: &Order, with: &[&[u8]]) -> Result<()> {
         let message =
             serde_json::to_vec(order).map_err(|e| Error::Fault(format!("an order cannot be written: {e}")))?;
-        (1..self.team.size()).for_each(|rank| self.team.send(rank, &message));
+        for rank in 1..self.team.size() {
+            self.team.send(rank, &message);
+            with.iter().for_each(|bytes| self.team.send(rank, bytes));
+        }
         Ok(())
     }
 }
@@ -110,30 +137,15 @@ pub enum Order {
         /// Number of threads.
         threads: usize,
     },
-    /// Drive seeds of a drive.
-    Drive {
-        /// The command line of rank 0.
-        arguments: Vec<String>,
-        /// Whether the driver is that of `--against`.
-        against: bool,
-        /// What [`fingerprint`] says of the files on rank 0.
-        fingerprint: String,
+    /// Do tasks of a piece of [work](tasks::Work). The next message says what they have in common.
+    Work {
+        /// The [kind of work](tasks::Work::NAME).
+        name: String,
         /// Number of threads.
         threads: usize,
     },
     /// There is no more work.
     End,
-}
-
-/// Digest of `files`, in hexadecimal digits, by which ranks see whether they have the same ones. A file that is not there counts as empty.
-pub fn fingerprint(files: &[PathBuf]) -> String {
-    let mut hash = Sha256::new();
-    for file in files {
-        let bytes = std::fs::read(file).unwrap_or_default();
-        hash.update((bytes.len() as u64).to_le_bytes());
-        hash.update(bytes);
-    }
-    hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 /// Whether this process does what rank 0 tells it, and prints nothing.
@@ -151,12 +163,17 @@ pub fn await_order(team: &dyn Team) -> Result<Order> {
     serde_json::from_slice(&message).map_err(|e| Error::Fault(format!("an order of rank 0 cannot be read: {e}")))
 }
 
+/// Waits for what rank 0 sends with an order.
+pub fn await_bytes(team: &dyn Team) -> Vec<u8> {
+    await_message(team).1
+}
+
 /// Waits for the next message, without keeping a core busy.
-fn await_message(team: &dyn Team) -> (usize, Vec<u8>) {
+pub(crate) fn await_message(team: &dyn Team) -> (usize, Vec<u8>) {
     loop {
         match team.try_receive() {
             Some(message) => return message,
-            None => std::thread::sleep(std::time::Duration::from_millis(1)),
+            None => std::thread::sleep(Duration::from_millis(1)),
         }
     }
 }
@@ -176,7 +193,7 @@ pub fn threads(threads: usize) -> usize {
         Some(ranks) if threads == 0 && ranks > 1 => {
             // A launcher that binds its processes to cores has shared them out already.
             let allowed = std::thread::available_parallelism().map_or(1, usize::from);
-            allowed.min((cores() / ranks).max(1))
+            allowed.min((process::cores() / ranks).max(1))
         }
         _ => threads,
     }
@@ -202,12 +219,6 @@ pub fn require_alone() -> Result<()> {
              it with --features mpi"
         ))),
     }
-}
-
-/// Cores of the machine, whether or not this process may use them.
-fn cores() -> usize {
-    let listed = std::fs::read_to_string("/proc/cpuinfo").map_or(0, |text| text.matches("\nprocessor\t").count() + 1);
-    listed.max(std::thread::available_parallelism().map_or(1, usize::from))
 }
 
 /// The result of this rank if all ranks succeeded, else an error. All ranks call it at once.

@@ -6,6 +6,7 @@ use std::panic::AssertUnwindSafe;
 use std::process::ExitCode;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
 
 use mpi::Threading;
 use mpi::datatype::{Partition, PartitionMut};
@@ -68,6 +69,7 @@ fn join(universe: &Universe, threading: Threading, say: &impl Fn(&str)) -> Resul
         size: world.size() as usize,
         on_this_machine: node.size() as usize,
         sent_bytes: AtomicU64::new(0),
+        met_ns: AtomicU64::new(0),
         calls: Mutex::default(),
     });
     let threads = match threading {
@@ -111,6 +113,7 @@ struct MpiTeam {
     size: usize,
     on_this_machine: usize,
     sent_bytes: AtomicU64,
+    met_ns: AtomicU64,
     /// MPI is called by one thread at a time.
     calls: Mutex<()>,
 }
@@ -130,10 +133,19 @@ impl MpiTeam {
         if all.is_empty() {
             return;
         }
+        self.meet(|world| {
+            self.count(size_of_val(mine) * (self.size - 1));
+            let (counts, starts) = counts_and_starts(counts);
+            world.all_gather_varcount_into(mine, &mut PartitionMut::new(all, counts, starts));
+        });
+    }
+
+    /// Does `together` what all ranks do at once, and adds its time.
+    fn meet(&self, together: impl FnOnce(SimpleCommunicator)) {
+        let began = Instant::now();
         let (_call, world) = self.call();
-        self.count(size_of_val(mine) * (self.size - 1));
-        let (counts, starts) = counts_and_starts(counts);
-        world.all_gather_varcount_into(mine, &mut PartitionMut::new(all, counts, starts));
+        together(world);
+        self.met_ns.fetch_add(began.elapsed().as_nanos() as u64, Ordering::Relaxed);
     }
 }
 
@@ -165,12 +177,13 @@ impl Ranks for MpiTeam {
     }
 
     fn exchange_f32(&self, send: &[f32], send_counts: &[usize], receive: &mut [f32], receive_counts: &[usize]) {
-        let (_call, world) = self.call();
-        self.count(4 * (send.len() - send_counts[self.rank]));
-        let (send_counts, send_starts) = counts_and_starts(send_counts);
-        let (receive_counts, receive_starts) = counts_and_starts(receive_counts);
-        let send = Partition::new(send, send_counts, send_starts);
-        world.all_to_all_varcount_into(&send, &mut PartitionMut::new(receive, receive_counts, receive_starts));
+        self.meet(|world| {
+            self.count(4 * (send.len() - send_counts[self.rank]));
+            let (send_counts, send_starts) = counts_and_starts(send_counts);
+            let (receive_counts, receive_starts) = counts_and_starts(receive_counts);
+            let send = Partition::new(send, send_counts, send_starts);
+            world.all_to_all_varcount_into(&send, &mut PartitionMut::new(receive, receive_counts, receive_starts));
+        });
     }
 }
 
@@ -210,5 +223,9 @@ impl Team for MpiTeam {
 
     fn sent_bytes(&self) -> u64 {
         self.sent_bytes.load(Ordering::Relaxed)
+    }
+
+    fn met(&self) -> Duration {
+        Duration::from_nanos(self.met_ns.load(Ordering::Relaxed))
     }
 }

@@ -7,7 +7,7 @@ use crate::error::{Error, Result};
 /// Where the camera sits, how it sees, and how the car turns.
 ///
 /// Lenses are pinholes without distortion. Pixel centres lie at halves, the optical axis goes through the middle of the picture.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct CarGeometry {
     /// Height and width of the picture that `focal_px` refers to, pixels.
     pub image: [usize; 2],

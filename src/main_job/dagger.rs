@@ -2,13 +2,12 @@
 
 use std::path::{Path, PathBuf};
 
-use super::training_set::{Take, record_takes};
+use super::training_set::{Take, with_requests};
 use crate::error::Result;
 use crate::files::new_folder::NewFolder;
 use crate::observer::{Observer, Progress};
 use crate::pilot::Pilot;
-use crate::simulator::recorder::expert_drive::drive_and_label;
-use crate::simulator::recorder::record::write_recording;
+use crate::simulator::{Wheel, record_driven};
 
 /// Fraction of each take's laps that the model drives.
 const LAPS: f64 = 0.5;
@@ -40,10 +39,9 @@ pub fn recordings(
     let takes = takes_of_round(takes, round);
     if !out.exists() {
         let new = NewFolder::create(out)?;
-        let recorded = record_takes(&takes, new.unfinished(), observer, |track, take, folder, observer| {
-            let options = take.options(None);
-            let samples = drive_and_label(track, &options, &mut pilot.clone(), expert_share(round))?;
-            write_recording(track, &options, &samples, folder, observer).map(drop)
+        let wheel = Wheel::Model(Box::new(pilot.clone()));
+        let recorded = with_requests(&takes, None, new.unfinished(), |requests| {
+            record_driven(requests, &wheel, expert_share(round), observer)
         });
         recorded.map_err(|error| new.explain(error))?;
         new.finish()?;

@@ -19,11 +19,11 @@ use crate::engine::network::LayerSpec;
 use crate::engine::optimizer::AveragingSpec;
 use crate::error::{Error, Result};
 use crate::files::atomic_file;
-use crate::observer::{Observer, Parts, StopSignal};
+use crate::observer::{Observer, StopSignal};
 use crate::pilot::Pilot;
 use crate::recipe::Recipe;
 use crate::simulator::car::expert::Style;
-use crate::simulator::{DriveOptions, RecordOptions, Track, record};
+use crate::simulator::{DriveOptions, RecordOptions, RecordRequest, Track, record_all};
 use crate::training::{self, TrainRequest};
 
 /// The setting that an experiment varies.
@@ -208,7 +208,7 @@ pub fn takes(random_tracks: usize) -> Vec<training_set::Take> {
 ///
 /// # Errors
 ///
-/// As [`record`]; [`Error::Interrupted`] if `stop` is requested.
+/// As [`record_all`]; [`Error::Interrupted`] if `stop` is requested.
 pub fn keyboard_drives(
     folder: &Path,
     observer: &mut (dyn Observer<JobEvent> + Send),
@@ -216,18 +216,19 @@ pub fn keyboard_drives(
 ) -> Result<Vec<PathBuf>> {
     let track = Track::load("lake")?;
     observed("recording drives with keys".into(), observer, stop, |observer| {
-        let parts = Parts::new(vec![1.0; 2], observer);
-        let drive = |(number, reverse): (usize, bool)| {
-            let out = folder.join(if reverse { "lake-reverse" } else { "lake" });
-            let options = RecordOptions {
+        let drive = |(number, reverse): (usize, bool)| RecordRequest {
+            track: &track,
+            options: RecordOptions {
                 reverse,
                 style: Style::Keyboard,
                 seed: KEYBOARD_SEED + number as u64,
                 ..Default::default()
-            };
-            record(&track, &options, &out, &mut parts.part(number)).map(|_| out)
+            },
+            out: folder.join(if reverse { "lake-reverse" } else { "lake" }),
         };
-        [false, true].into_iter().enumerate().map(drive).collect()
+        let requests = [(0, false), (1, true)].map(drive);
+        record_all(&requests, observer)?;
+        Ok(requests.map(|request| request.out).to_vec())
     })
 }
 

@@ -1,21 +1,24 @@
 //! The main job from first to last: record the expert, train, let the model drive and learn from that (DAgger), test.
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
-use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use steersman_kernels::conv::ConvAlgorithm;
 
 use super::training_set::{self, Take};
-use super::{MainJobResult, TRACKS, TrackResult, dagger, test_on_track};
+use super::{MainJobResult, TRACKS, TrackResult, dagger};
 
 use crate::error::{Error, Result};
 use crate::files::checksums;
+use crate::files::new_folder::NewFolder;
 use crate::geometry::CarGeometry;
-use crate::observer::{Observer, Parts, Progress, StopSignal};
+use crate::observer::{Observer, Progress, StopSignal};
 use crate::pilot::Pilot;
 use crate::recipe::Recipe;
-use crate::simulator::{DriveOptions, Track};
+use crate::report::charts::map;
+use crate::simulator::trial::trajectory::write_trajectories;
+use crate::simulator::{DriveOptions, Leg, LegResult, Track, Wheel, drive_legs};
 use crate::training::{self, RunFolder, TrainRequest, TrainResult, TrainingEvent, TransferRequest};
 
 /// Where the main job keeps what it records.
@@ -163,7 +166,7 @@ impl<'a> Job<'a> {
     ///
     /// # Errors
     ///
-    /// As [`training_set::recordings`], [`training::train`] and [`test_on_track`]; [`Error::Interrupted`] after a stop.
+    /// As [`training_set::recordings`], [`training::train`] and [`test_on_tracks`]; [`Error::Interrupted`] after a stop.
     pub fn begin(&mut self, request: JobRequest) -> Result<MainJobResult> {
         let JobRequest { recipe, out, seed, cache_mib, from, algorithm } = request;
         RunFolder::require_free(&out)?;
@@ -264,13 +267,13 @@ impl<'a> Job<'a> {
     }
 }
 
-/// Tests `pilot` on all of `tracks` at once; the results are in their order, trajectories below `keep`. Call it
-/// inside a rayon pool.
+/// Tests `pilot` on all of `tracks` at once, on all ranks; the results are in their order. The trajectories of a track are saved in a folder
+/// of its own below `keep`, if that is given; a folder that this test left there before a stop is kept. Call it inside a rayon pool.
 ///
 /// # Errors
 ///
-/// As [`test_on_track`]; [`Error::Interrupted`] if `stop` is requested.
-pub fn test_on_tracks<T: AsRef<str> + Sync>(
+/// As [`drive_legs`] and `write_trajectories`; [`Error::Interrupted`] if `stop` is requested.
+pub fn test_on_tracks<T: AsRef<str>>(
     pilot: &Pilot,
     tracks: &[T],
     options: &DriveOptions,
@@ -279,12 +282,29 @@ pub fn test_on_tracks<T: AsRef<str> + Sync>(
     stop: &StopSignal,
 ) -> Result<Vec<TrackResult>> {
     observed(format!("driving on {} tracks", tracks.len()), observer, stop, |observer| {
-        let parts = Parts::new(vec![1.0; tracks.len()], observer);
-        let on_track = |(number, name): (usize, &T)| {
-            let track = Track::load(name.as_ref())?;
-            test_on_track(pilot, &track, options, keep, &mut parts.part(number))
+        let leg = |name: &T| {
+            let track = Arc::new(Track::load(name.as_ref())?);
+            Ok(Leg { track, options: options.clone() })
         };
-        tracks.par_iter().enumerate().map(on_track).collect()
+        let legs: Vec<Leg> = tracks.iter().map(leg).collect::<Result<_>>()?;
+        let wheel = Wheel::Model(Box::new(pilot.clone()));
+        let (results, _) = drive_legs(&wheel, legs.clone(), true, observer)?;
+        let result = |(LegResult { drive, offline_mae_deg, complete }, leg): (LegResult, &Leg)| -> Result<_> {
+            // What is whole is kept, also after a stop.
+            let (Some(drive), Some(offline_mae_deg), true) = (drive, offline_mae_deg, complete) else {
+                return Ok(None);
+            };
+            // Names of random tracks have a colon, which no file's name has everywhere.
+            let folder = keep.map(|keep| keep.join(leg.track.name().replace(['/', '\\', ':'], "-")));
+            if let Some(folder) = folder.filter(|folder| !folder.exists()) {
+                let folder = NewFolder::create(&folder)?;
+                map::write(&leg.track, &drive, &folder)?;
+                write_trajectories(&drive, folder)?;
+            }
+            Ok(Some(TrackResult { drive: drive.summary, offline_mae_deg }))
+        };
+        let results = results.into_iter().zip(&legs).map(result).collect::<Result<Vec<_>>>()?;
+        results.into_iter().collect::<Option<_>>().ok_or(Error::Interrupted)
     })
 }
 

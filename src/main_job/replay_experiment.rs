@@ -1,7 +1,8 @@
 //! Does driving on a recording tell how well a model drives? Models of all qualities drive in the simulator and on recordings of
 //! the same tracks, and the orders that come of it are compared.
 
-use std::path::{Path, PathBuf};
+use std::ops::Range;
+use std::path::Path;
 
 use rand::Rng;
 use serde::Serialize;
@@ -21,7 +22,7 @@ use crate::replay::{Side, judge};
 use crate::report::charts::chart::{Axis, Chart, Mark};
 use crate::report::charts::palette;
 use crate::report::pages::html::Page;
-use crate::simulator::{DriveOptions, RecordOptions, Track, record};
+use crate::simulator::{DriveOptions, RecordOptions, RecordRequest, Track, record_all};
 use crate::statistics::rank_correlation;
 use crate::training::{self, TrainRequest};
 
@@ -198,27 +199,27 @@ pub fn run(
 ) -> Result<Vec<ReplayRow>> {
     let scratch = tempfile::tempdir().map_err(Error::io(std::env::temp_dir()))?;
     let folder = scratch.path();
+    let tracks: Vec<Track> = plan.tracks.iter().map(|name| Track::load(name)).collect::<Result<_>>()?;
+    let mut requests = Vec::new();
+    for (number, track) in tracks.iter().enumerate() {
+        for (what, first_seed, laps) in
+            [("lap", SEEDS[0], plan.laps[0]), ("tenth", SEEDS[0], 0.1 * plan.laps[0]), ("test", SEEDS[1], plan.laps[1])]
+        {
+            for reverse in [false, true] {
+                let seed = first_seed + 2 * number as u64 + u64::from(reverse);
+                let options = RecordOptions { laps, reverse, seed, ..RecordOptions::default() };
+                requests.push(RecordRequest { track, options, out: folder.join(format!("{what}-{number}-{reverse}")) });
+            }
+        }
+    }
+    record_all(&requests, &mut |_| stop.check())?;
     let mut tested = Vec::new();
     let mut trained = [Vec::new(), Vec::new()];
-    for (number, name) in plan.tracks.iter().enumerate() {
-        let track = Track::load(name)?;
-        let on = |what: &str, seed: u64, laps: f64, reverse: bool| -> Result<PathBuf> {
-            let out = folder.join(format!("{what}-{number}-{reverse}"));
-            let options = RecordOptions { laps, reverse, seed, ..RecordOptions::default() };
-            record(&track, &options, &out, &mut |_| stop.check())?;
-            Ok(out)
-        };
-        for reverse in [false, true] {
-            let seed = 2 * number as u64 + u64::from(reverse);
-            trained[0].push(on("lap", SEEDS[0] + seed, plan.laps[0], reverse)?);
-            trained[1].push(on("tenth", SEEDS[0] + seed, 0.1 * plan.laps[0], reverse)?);
-        }
-        let on_track: Vec<PathBuf> = [false, true]
-            .map(|reverse| on("test", SEEDS[1] + 2 * number as u64 + u64::from(reverse), plan.laps[1], reverse))
-            .into_iter()
-            .collect::<Result<_>>()?;
-        let recordings: Vec<Recording> = on_track.iter().map(|path| dataset::load(path)).collect::<Result<_>>()?;
-        tested.push(recordings);
+    for of_track in requests.chunks_exact(6) {
+        let outs = |part: Range<usize>| of_track[part].iter().map(|request| request.out.clone());
+        trained[0].extend(outs(0..2));
+        trained[1].extend(outs(2..4));
+        tested.push(outs(4..6).map(|path| dataset::load(&path)).collect::<Result<Vec<Recording>>>()?);
     }
     let mut made: Vec<Model> = Vec::new();
     let mut rows = Vec::new();

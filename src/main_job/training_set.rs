@@ -9,9 +9,9 @@ use sha2::{Digest, Sha256};
 use crate::error::{Error, Result};
 use crate::files::new_folder::NewFolder;
 use crate::geometry::CarGeometry;
-use crate::observer::{Observer, Parts, Progress};
+use crate::observer::{Observer, Progress};
 use crate::recipe::Recipe;
-use crate::simulator::{RecordOptions, Track, record};
+use crate::simulator::{RecordOptions, RecordRequest, Track, record_all};
 
 /// Random tracks in the set. Variety of looks teaches more than laps: each is driven for a fraction of a lap.
 pub const RANDOM_TRACKS: u64 = 48;
@@ -149,9 +149,7 @@ pub fn recordings(
         return Ok((paths, true));
     }
     let new = NewFolder::create(&set)?;
-    let recorded = record_takes(takes, new.unfinished(), observer, |track, take, folder, observer| {
-        record(track, &take.options(car), folder, observer).map(drop)
-    });
+    let recorded = with_requests(takes, car, new.unfinished(), |requests| record_all(requests, observer));
     recorded.map_err(|error| new.explain(error))?;
     let side = new.unfinished().join("set.toml");
     std::fs::write(&side, settings).map_err(|source| new.explain(Error::Io { path: side, source }))?;
@@ -159,30 +157,33 @@ pub fn recordings(
     Ok((paths, false))
 }
 
-/// Records `takes` into folders of their own under `folder`, each by `how` (track, take, its folder, its observer), tracks
-/// in parallel. `observer` is told the share of all that is recorded.
+/// Lets `record` make the recordings of `takes`, as `car` sees them or the simulator's own, in folders of their own under `folder`.
 ///
 /// # Errors
 ///
-/// [`Error::Usage`] for held-out tracks; as `how`.
-pub(super) fn record_takes(
+/// [`Error::Usage`] for held-out tracks; as `record`.
+pub(super) fn with_requests<T>(
     takes: &[Take],
+    car: Option<&CarGeometry>,
     folder: &Path,
-    observer: &mut (dyn Observer<Progress> + Send),
-    how: impl Fn(&Track, &Take, &Path, &mut (dyn Observer<Progress> + Send)) -> Result<()> + Sync,
-) -> Result<()> {
-    let parts = Parts::new(takes.iter().map(|take| take.laps).collect(), observer);
-    let numbered: Vec<(usize, &Take)> = takes.iter().enumerate().collect();
-    let of_tracks: Vec<_> = numbered.chunk_by(|(_, a), (_, b)| a.track == b.track).collect();
-    of_tracks.into_par_iter().try_for_each(|group| {
-        let track = Track::load(&group[0].1.track)?;
+    record: impl FnOnce(&[RecordRequest]) -> Result<T>,
+) -> Result<T> {
+    let load = |of_track: &[Take]| {
+        let track = Track::load(&of_track[0].track)?;
         if track.held_out() {
             return Err(Error::Usage(format!("{} is held out; the training set must not have it", track.name())));
         }
-        group
-            .iter()
-            .try_for_each(|&(number, take)| how(&track, take, &folder.join(take.folder()), &mut parts.part(number)))
-    })
+        Ok((track, of_track.len()))
+    };
+    let of_tracks: Vec<&[Take]> = takes.chunk_by(|a, b| a.track == b.track).collect();
+    let tracks: Vec<(Track, usize)> = of_tracks.into_par_iter().map(load).collect::<Result<_>>()?;
+    let of_takes = tracks.iter().flat_map(|(track, takes)| std::iter::repeat_n(track, *takes));
+    let request = |(track, take): (_, &Take)| RecordRequest {
+        track,
+        options: take.options(car),
+        out: folder.join(take.folder()),
+    };
+    record(&of_takes.zip(takes).map(request).collect::<Vec<_>>())
 }
 
 #[cfg(test)]

@@ -6,7 +6,7 @@
 use std::ops::{Add, Mul, Neg, Sub};
 
 /// A point or direction in the world: x east, y north, z up, in metres.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct Vec3 {
     /// East.
     pub x: f32,

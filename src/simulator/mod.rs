@@ -6,10 +6,11 @@
 //!
 //! Each room uses only those before it: `math`, `road` (the line, the track file, random tracks), `scenery` (the visible
 //! world), `track` (a road with its world), `car` (its motion, the expert), `camera` (its frames), `trial` (a measured drive),
-//! `recorder` (a drive as a recording).
+//! `recorder` (a drive as a recording), `drives` (many drives, which several processes share).
 
 pub(crate) mod camera;
 pub(crate) mod car;
+pub(crate) mod drives;
 pub(crate) mod math;
 pub(crate) mod recorder;
 pub(crate) mod road;
@@ -25,19 +26,25 @@ pub use camera::renderer::Renderer;
 pub use car::pose::BodyPose;
 pub use car::simulation::{Simulation, Start};
 pub use car::speed::{Pace, Speed, SpeedController};
+#[cfg(feature = "mpi")]
+pub(crate) use drives::Drives;
+pub use drives::{Leg, LegResult, drive_legs, offline_mae_deg};
 pub use recorder::options::{LogFormat, RecordOptions};
-pub use recorder::record::record;
+#[cfg(feature = "mpi")]
+pub(crate) use recorder::photograph::Photographs;
+pub use recorder::record::{RecordRequest, record, record_all, record_driven};
 pub use road::line::{Location, Road, Station};
 pub use scenery::light::Variant;
 pub use scenery::world::World;
 pub use track::Track;
 pub use trial::closed_loop::ClosedLoop;
-pub use trial::drive::{compare, drive, drive_as_far, drive_observed, drive_observed_as_far, help_drive};
+pub use trial::drive::{compare, drive, drive_as_far, drive_observed, drive_observed_as_far};
 pub use trial::driver::{DriveState, Driver, DriverAnswer, Expert, InCar, Zero};
 pub use trial::event::{DriveEvent, DriveFrame};
 pub use trial::outcome::{Failure, Trial, TrialOptions};
 pub use trial::run::{run_trial, run_trial_observed};
 pub use trial::summary::{DriveOptions, DriveResult, DriveSummary};
+pub use trial::wheel::Wheel;
 
 #[cfg(test)]
 mod tests;

@@ -84,6 +84,11 @@ impl Track {
         Road::from_spec(spec, place).map(Track::new)
     }
 
+    /// The track whose road has this description, on another rank or with its visible world yet to be built.
+    pub(crate) fn again(spec: TrackSpec) -> Track {
+        Track::new(Road::again(spec))
+    }
+
     /// Whether the track is held out of training.
     pub fn held_out(&self) -> bool {
         self.spec.held_out

@@ -1,6 +1,6 @@
 //! The loop over the epochs of a run.
 
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use ndarray::ArrayView1;
 use steersman_kernels::{Backend, Isa};
@@ -15,6 +15,7 @@ use super::run_folder::{RunFolder, RunInfo, RunLock};
 use super::together::Together;
 use super::transfer::Start;
 use super::validation::{Validation, ValidationResult};
+use crate::cluster::process::peak_memory_mb;
 use crate::dataset::loader::{Batch, Loader};
 use crate::engine::loss::{PairTerms, Smoothness};
 use crate::engine::network::{Network, StepInput, TrainingPlan};
@@ -171,6 +172,7 @@ impl TrainingRun {
     ) -> Result<()> {
         self.together.meet(Ok(true), begun)?;
         let (updates_before, sent_before) = (self.state.optimizer.updates, self.together.sent_bytes());
+        let (mut stepping, mut meeting) = (Duration::ZERO, Duration::ZERO);
         let seconds_before = self.state.progress.seconds;
         let mut images_unreported = true;
         let mut batches = [Batch::default(), Batch::default()];
@@ -178,7 +180,10 @@ impl TrainingRun {
             let epoch_started = Instant::now();
             // In the first whole epoch of this process every image is decoded.
             let whole = self.state.progress.next_batch == 0;
+            let met_before = self.together.met();
             self.train_epoch(&mut batches, observer, stop, seconds_before)?;
+            stepping += epoch_started.elapsed();
+            meeting += self.together.met() - met_before;
             if self.state.progress.images == 0 {
                 let examples = self.training.undecodable().1.join("; ");
                 return Err(Error::Data {
@@ -204,8 +209,8 @@ impl TrainingRun {
             let observed = observer.observe(TrainingEvent::Epoch { record, of: self.recipe.epochs });
             let reported = match whole && std::mem::take(&mut images_unreported) {
                 true => {
-                    self.share_thumbnails();
-                    self.report_images(observer)
+                    self.collect_thumbnails();
+                    if self.together.leads() { self.report_images(observer) } else { Ok(()) }
                 }
                 false => Ok(()),
             };
@@ -213,22 +218,38 @@ impl TrainingRun {
             let saved = self.save_checkpoint();
             self.together.meet(Ok(true), saved.and(observed).and(reported))?;
         }
-        self.share_thumbnails();
+        self.collect_thumbnails();
         let updates = self.state.optimizer.updates - updates_before;
-        if let Some(team) = self.together.team().filter(|_| updates > 0) {
-            let sent = self.together.sent_bytes() - sent_before;
-            let (ranks, each) = (team.size(), sent as f64 / updates as f64 / 1e6);
-            let notice = format!("{ranks} ranks made {updates} steps together; each sent about {each:.2} MB a step");
+        if self.together.team().is_some() && updates > 0 {
+            let each_mb = (self.together.sent_bytes() - sent_before) as f64 / updates as f64 / 1e6;
+            let meeting = 100.0 * meeting.as_secs_f64() / stepping.as_secs_f64();
+            let notice = self.together_notice(updates, each_mb, meeting);
             observer.observe(TrainingEvent::Notice(notice))?;
         }
         Ok(())
     }
 
-    fn share_thumbnails(&self) {
-        self.together.share_thumbnails(&self.training);
-        if let Some(validation) = &self.validation {
-            self.together.share_thumbnails(validation.loader());
-        }
+    /// What working together has cost, where each rank sent about `each_mb` a step and this one spent `meeting` percent of its time where all
+    /// meet. All ranks call it at once.
+    fn together_notice(&self, updates: u64, each_mb: f64, meeting: f64) -> String {
+        let meeting = self.together.of_all(meeting);
+        let memory = self.together.of_all(peak_memory_mb().unwrap_or_default());
+        let ranks = meeting.len();
+        let range = |values: &[f64]| {
+            let (low, high) = values.iter().fold((f64::MAX, 0.0f64), |(low, high), v| (low.min(*v), high.max(*v)));
+            format!("{low:.0} to {high:.0}")
+        };
+        format!(
+            "{ranks} ranks made {updates} steps together; each sent about {each_mb:.2} MB a step, spent {} % of the steps' time waiting \
+             for others and for data on its way, and needed {} MB of memory",
+            range(&meeting),
+            range(&memory)
+        )
+    }
+
+    fn collect_thumbnails(&self) {
+        let validation = self.validation.as_ref().map(Validation::loader);
+        self.together.collect_thumbnails(&[&self.training].into_iter().chain(validation).collect::<Vec<_>>());
     }
 
     /// Trains on the remaining batches of the current epoch.

@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
 
@@ -108,11 +108,40 @@ impl Together {
         team.gather_f32(values, &counts, all);
     }
 
-    /// Lets the audit of near twins of `loader` know what all ranks know of its pictures.
-    pub fn share_thumbnails(&self, loader: &Loader) {
-        if let Some(team) = &self.team {
-            team.gather_bytes(&loader.thumbnails()).iter().for_each(|bytes| loader.take_thumbnails(bytes));
+    /// Lets the audit of near twins of each of `loaders` on rank 0, which alone tells of them, know what all ranks know of their pictures.
+    pub fn collect_thumbnails(&self, loaders: &[&Loader]) {
+        let Some(team) = &self.team else { return };
+        if team.rank() > 0 {
+            for (number, loader) in (0u8..).zip(loaders) {
+                loader.thumbnails(|piece| team.send(0, &[&[number][..], piece].concat()));
+            }
+            return team.send(0, &[]);
         }
+        let mut others = team.size() - 1;
+        while others > 0 {
+            let (_, message) = cluster::await_message(&**team);
+            match message.split_first() {
+                Some((number, piece)) => {
+                    if let Some(loader) = loaders.get(usize::from(*number)) {
+                        loader.take_thumbnails(piece);
+                    }
+                }
+                None => others -= 1,
+            }
+        }
+    }
+
+    /// What `mine` is on each rank. All ranks call it at once.
+    pub fn of_all(&self, mine: f64) -> Vec<f64> {
+        let Some(team) = &self.team else { return vec![mine] };
+        let mut all = vec![0.0; team.size()];
+        team.gather_f64(&[mine], &vec![1; team.size()], &mut all);
+        all
+    }
+
+    /// Time that this process has spent so far where all meet.
+    pub fn met(&self) -> Duration {
+        self.team.as_ref().map_or(Duration::ZERO, |team| team.met())
     }
 }
 
@@ -124,7 +153,7 @@ pub(super) fn invite(run: &mut TrainingRun, given: &RunInfo) -> Result<Option<Cl
     let job = Job { info: given.clone(), recipe_name, recipe };
     let job = serde_json::to_string(&job).map_err(|e| Error::Fault(format!("the run cannot be told: {e}")))?;
     let state = run.state.to_bytes(STATE.as_ref(), &run.network)?;
-    claim.order(&Order::Train { job, threads: cluster::asked_threads() })?;
+    claim.order(&Order::Train { job, threads: cluster::asked_threads() }, &[])?;
     let team = claim.team().clone();
     agree(&*team, Ok(()))?;
     team.gather_bytes(&state);

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use clap::Args;
 
-use super::{DriveArgs, Wheel};
+use super::DriveArgs;
 use crate::cli::process::{stop_on_ctrl_c, stop_or_ok};
 use crate::cli::terminal::{ShareBar, counted, or_dash, print, print_json};
 use crate::donkeysim::DEFAULT_PORT;
@@ -14,9 +14,9 @@ use crate::error::{Error, Result};
 use crate::files::limits::keep_elsewhere;
 use crate::files::new_folder::NewFolder;
 use crate::observer::Observer;
-use crate::simulator::DriverAnswer;
 use crate::simulator::trial::outcome::Failure;
 use crate::simulator::trial::trajectory::trajectory_csv;
+use crate::simulator::{DriverAnswer, Wheel};
 use crate::simulator_client::ClientEvent;
 use crate::text::excerpt;
 

@@ -4,24 +4,20 @@ mod donkeysim;
 mod on_recording;
 mod sweep;
 
-use std::ffi::OsString;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use clap::Args;
 use serde::Serialize;
 
-use super::arguments::{RecordingArgs, Throttle, camera_preset, load_pilot, model_file};
+use super::arguments::{RecordingArgs, Throttle, camera_preset, load_pilot};
 use super::process::{pool, stop_on_ctrl_c, stop_or_ok};
 use super::terminal::{ShareBar, counted, print, print_json};
 use super::video::tell_video;
-#[cfg(feature = "mpi")]
-use crate::cluster::Team;
-use crate::cluster::{self, Claim, Order, fingerprint};
 use crate::dataset::held_out::trained_on_held_out;
 use crate::error::{Error, Result};
 use crate::files::limits::keep_elsewhere;
 use crate::files::new_folder::NewFolder;
-use crate::geometry::CarGeometry;
 use crate::live::{DEFAULT_PORT, Hello, Live, Watch};
 use crate::observer::StopSignal;
 use crate::pilot::Pilot;
@@ -30,13 +26,10 @@ use crate::report::pages::sweep::Swept;
 use crate::report::video::drive::DriveVideo;
 use crate::report::video::onlooker::Onlooker;
 use crate::report::video::painter::Captions;
-#[cfg(feature = "mpi")]
-use crate::simulator::help_drive;
 use crate::simulator::trial::statistics::PairedTest;
 use crate::simulator::trial::trajectory::write_trajectories;
 use crate::simulator::{
-    DriveOptions, DriveResult, DriveSummary, Driver, Expert, InCar, Speed, Track, Zero, compare, drive_as_far,
-    drive_observed_as_far,
+    DriveOptions, DriveResult, DriveSummary, Leg, Speed, Track, Wheel, compare, drive_legs, drive_observed_as_far,
 };
 use donkeysim::DonkeyDriveArgs;
 use on_recording::ReplayArgs;
@@ -150,7 +143,7 @@ pub fn run(args: DriveArgs) -> Result<()> {
         return Err(Error::Usage("--noise disturbs the steering on a track, not on a recording: leave it out".into()));
     }
     let track = match (&args.on, &args.track) {
-        (None, Some(track)) => Track::load(track)?,
+        (None, Some(track)) => Arc::new(Track::load(track)?),
         (None, None) => return Err(Error::Usage("name a track with --track, or a recording with --on".into())),
         (Some(on), _) => {
             return on_recording::run(&ReplayArgs {
@@ -176,7 +169,6 @@ pub fn run(args: DriveArgs) -> Result<()> {
         ));
     }
     let options = args.options()?;
-    // Before other ranks are told of the drive.
     options.check()?;
     if let Some((swept, values)) = swept {
         return sweep::run(&args, &track, &options, swept, values);
@@ -188,28 +180,17 @@ pub fn run(args: DriveArgs) -> Result<()> {
     let then = args.against.as_ref().map_or(String::new(), |name| format!(", then {name}"));
     let hello = || Hello::new("watch", format!("at the wheel: {}{then}", args.model), &track);
     let live = args.watch.then(|| Live::start(args.port, hello(), false)).transpose()?;
-    let video = args.video.as_deref().map(|path| at_wheel.video(path, &track, &args)).transpose()?;
+    let video = args.video.as_deref().map(|path| begin_video(&at_wheel, path, &track, &args)).transpose()?;
     let stop = stop_on_ctrl_c()?;
     if let Some(live) = &live {
         eprintln!("open {} to watch", live.url());
     }
     let pool = pool(args.threads)?;
-    // A page shows one run after the other.
-    let claim = if live.is_none() { Claim::of_leader() } else { None };
-    let go = |wheel: &Wheel, name: &str, against: bool| {
-        if let Some(claim) = &claim {
-            claim.order(&Order::Drive {
-                arguments: arguments()?,
-                against,
-                fingerprint: args.fingerprint(name),
-                threads: cluster::asked_threads(),
-            })?;
-        }
-        pool.install(|| wheel.drive(&track, &options, name, live.as_ref(), &stop, claim.as_ref()))
-    };
-    let (result, mut stopped) = go(&at_wheel, &args.model, false)?;
+    let go =
+        |wheel: &Wheel, name: &str| pool.install(|| drive_with(wheel, &track, &options, name, live.as_ref(), &stop));
+    let (result, mut stopped) = go(&at_wheel, &args.model)?;
     let other = match (&against, &args.against) {
-        (Some(wheel), Some(name)) if !stopped => match go(wheel, name, true) {
+        (Some(wheel), Some(name)) if !stopped => match go(wheel, name) {
             Ok((other, false)) => Some(other),
             Ok((_, true)) | Err(Error::Interrupted) => {
                 stopped = true;
@@ -249,7 +230,7 @@ pub fn run(args: DriveArgs) -> Result<()> {
             keep_elsewhere(cause, again, |other| format!("the drive is kept in {}", other.join("drive").display()))
         })
     });
-    let film = |video: DriveVideo| at_wheel.film(video, &track, &options, &args, &stop);
+    let film = |video: DriveVideo| film(&at_wheel, video, &track, &options, &args, &stop);
     if args.json {
         let against = other.as_ref().map(|other| &other.summary);
         // The JSON is the last line, so the video comes first; what it ends with must not hide what was measured.
@@ -271,30 +252,6 @@ pub fn run(args: DriveArgs) -> Result<()> {
     saved.and(video.map_or(Ok(()), film)).and(stop_or_ok(stopped))
 }
 
-/// The command line of this process.
-fn arguments() -> Result<Vec<String>> {
-    let unreadable = |argument: OsString| {
-        Error::Usage(format!("{}: several ranks take arguments in UTF-8 alone", argument.to_string_lossy()))
-    };
-    std::env::args_os().map(|argument| argument.into_string().map_err(unreadable)).collect()
-}
-
-/// Another rank than 0: drives seeds of the drive with these arguments, of `--against` or of the first model.
-#[cfg(feature = "mpi")]
-pub(super) fn help(team: &dyn Team, args: Result<&DriveArgs>, against: bool, fingerprint: &str) -> Result<()> {
-    let prepare = |args: &DriveArgs| {
-        let name = if against { args.against.as_deref().unwrap_or_default() } else { &args.model };
-        if args.fingerprint(name) != fingerprint {
-            let message =
-                "here is another file than rank 0 has; every rank must find the same model and track at this place";
-            return Err(Error::Data { place: name.into(), message: message.into() });
-        }
-        let (track, wheel) = (Track::load(args.track.as_deref().unwrap_or_default())?, args.wheel(name)?);
-        Ok((track, args.options()?, move || Ok(wheel.driver())))
-    };
-    help_drive(team, args.and_then(prepare))
-}
-
 impl DriveArgs {
     fn options(&self) -> Result<DriveOptions> {
         Ok(DriveOptions {
@@ -307,15 +264,13 @@ impl DriveArgs {
         })
     }
 
-    /// Of the model `name` and the track, as far as they are files.
-    fn fingerprint(&self, name: &str) -> String {
-        let model = model_file(Path::new(name)).unwrap_or_default();
-        fingerprint(&[model, self.track.as_ref().map(PathBuf::from).unwrap_or_default()])
-    }
-
     /// Who is called `name`, and gives what `--throttle` asks for.
     pub(super) fn wheel(&self, name: &str) -> Result<Wheel> {
-        let wheel = Wheel::find(name)?;
+        let wheel = match name {
+            "expert" => Wheel::Expert,
+            "zero" => Wheel::Zero,
+            path => Wheel::Model(Box::new(load_pilot(Path::new(path))?)),
+        };
         if let Wheel::Model(pilot) = &wheel {
             self.throttle.check(pilot, name)?;
         }
@@ -342,94 +297,65 @@ fn speed(text: &str) -> Result<Speed, String> {
     }
 }
 
-/// Who steers.
-pub(super) enum Wheel {
-    Expert,
-    Zero,
-    Model(Box<Pilot>),
-    /// Looking through the camera of another car.
-    InCar(Box<Pilot>, CarGeometry),
+/// The video of the first run of `wheel`, begun.
+fn begin_video(wheel: &Wheel, path: &Path, track: &Track, args: &DriveArgs) -> Result<DriveVideo> {
+    let onlooker = match wheel {
+        Wheel::Model(pilot) if args.saliency => Some(Onlooker::new(Pilot::clone(pilot), true)?),
+        _ if args.saliency => {
+            return Err(Error::Usage(format!("{} has no saliency; leave out --saliency", args.model)));
+        }
+        _ => None,
+    };
+    let names = Captions {
+        title: format!("{}, seed {}", track.name(), args.seed),
+        subtitle: args.model.clone(),
+        model: Some(if matches!(wheel, Wheel::Model(_)) { "model" } else { "driver" }),
+        reference: "expert",
+    };
+    DriveVideo::create(path, track, names, args.fps, onlooker)
 }
 
-impl Wheel {
-    pub(super) fn find(name: &str) -> Result<Wheel> {
-        Ok(match name {
-            "expert" => Wheel::Expert,
-            "zero" => Wheel::Zero,
-            path => Wheel::Model(Box::new(load_pilot(Path::new(path))?)),
-        })
+/// Lets `wheel` drive the first run again before the camera.
+fn film(
+    wheel: &Wheel,
+    video: DriveVideo,
+    track: &Track,
+    options: &DriveOptions,
+    args: &DriveArgs,
+    stop: &StopSignal,
+) -> Result<()> {
+    let mut bar = ShareBar::new("filming", stop);
+    let mut driver = wheel.driver();
+    let (summary, stopped) =
+        video.film(track, driver.as_mut(), &options.trial_options(false), options.seed, &mut bar)?;
+    drop(bar);
+    if let Some(path) = &args.video {
+        tell_video(path, &summary);
     }
+    stop_or_ok(stopped)
+}
 
-    fn driver(&self) -> Box<dyn Driver> {
-        match self {
-            Wheel::Expert => Box::new(Expert),
-            Wheel::Zero => Box::new(Zero),
-            Wheel::Model(pilot) => pilot.clone(),
-            Wheel::InCar(pilot, car) => Box::new(InCar { driver: Pilot::clone(pilot), car: car.clone() }),
-        }
-    }
-
-    /// The video of the first run, begun.
-    fn video(&self, path: &Path, track: &Track, args: &DriveArgs) -> Result<DriveVideo> {
-        let onlooker = match self {
-            Wheel::Model(pilot) if args.saliency => Some(Onlooker::new(Pilot::clone(pilot), true)?),
-            _ if args.saliency => {
-                return Err(Error::Usage(format!("{} has no saliency; leave out --saliency", args.model)));
-            }
-            _ => None,
-        };
-        let names = Captions {
-            title: format!("{}, seed {}", track.name(), args.seed),
-            subtitle: args.model.clone(),
-            model: Some(if matches!(self, Wheel::Model(_)) { "model" } else { "driver" }),
-            reference: "expert",
-        };
-        DriveVideo::create(path, track, names, args.fps, onlooker)
-    }
-
-    /// Drives the first run again before the camera.
-    fn film(
-        &self,
-        video: DriveVideo,
-        track: &Track,
-        options: &DriveOptions,
-        args: &DriveArgs,
-        stop: &StopSignal,
-    ) -> Result<()> {
-        let mut bar = ShareBar::new("filming", stop);
-        let mut driver = self.driver();
-        let (summary, stopped) =
-            video.film(track, driver.as_mut(), &options.trial_options(false), options.seed, &mut bar)?;
-        drop(bar);
-        if let Some(path) = &args.video {
-            tell_video(path, &summary);
-        }
-        stop_or_ok(stopped)
-    }
-
-    /// Drives, as far as nobody stops it. Also whether it was stopped.
-    pub(super) fn drive(
-        &self,
-        track: &Track,
-        options: &DriveOptions,
-        name: &str,
-        live: Option<&Live>,
-        stop: &StopSignal,
-        claim: Option<&Claim>,
-    ) -> Result<(DriveResult, bool)> {
-        let new_driver = || Ok(self.driver());
-        let (mut result, stopped) = if let Some(live) = live {
-            let pilot = if let Wheel::Model(pilot) = self { Some(&**pilot) } else { None };
-            drive_observed_as_far(track, new_driver, options, &mut Watch::new(live, name, pilot, options.runs, stop))?
-        } else {
-            let mut bar = ShareBar::new(format!("{name} on {}", track.name()), stop);
-            drive_as_far(track, new_driver, options, &mut bar, claim)?
-        };
-        if let Wheel::Model(pilot) | Wheel::InCar(pilot, _) = self {
-            result.summary.trained_on_held_out = pilot.trained_on_held_out().to_vec();
-        }
-        Ok((result, stopped))
-    }
+/// Lets `wheel`, called `name`, drive, as far as nobody stops it: on all ranks, or one run after the other where somebody watches. Also
+/// whether it was stopped.
+fn drive_with(
+    wheel: &Wheel,
+    track: &Arc<Track>,
+    options: &DriveOptions,
+    name: &str,
+    live: Option<&Live>,
+    stop: &StopSignal,
+) -> Result<(DriveResult, bool)> {
+    let Some(live) = live else {
+        let mut bar = ShareBar::new(format!("{name} on {}", track.name()), stop);
+        let leg = Leg { track: track.clone(), options: options.clone() };
+        let (results, stopped) = drive_legs(wheel, vec![leg], false, &mut bar)?;
+        let driven = results.into_iter().find_map(|result| result.drive).ok_or(Error::Interrupted)?;
+        return Ok((driven, stopped));
+    };
+    let mut watch = Watch::new(live, name, wheel.pilot(), options.runs, stop);
+    let (mut result, stopped) = drive_observed_as_far(track, || Ok(wheel.driver()), options, &mut watch)?;
+    result.summary.trained_on_held_out = wheel.trained_on_held_out().to_vec();
+    Ok((result, stopped))
 }
 
 fn summary_text(model: &str, s: &DriveSummary) -> String {

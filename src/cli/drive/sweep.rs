@@ -1,18 +1,19 @@
 //! `steersman drive --latency-ms 0,50,100`: the same drive under growing latency or noise.
 
 use std::path::Path;
+use std::sync::Arc;
 
 use serde::Serialize;
 
-use super::{DriveArgs, Wheel};
+use super::DriveArgs;
 use crate::cli::process::{pool, stop_on_ctrl_c, stop_or_ok};
-use crate::cli::terminal::{counted, print, print_json, right_aligned};
+use crate::cli::terminal::{ShareBar, counted, print, print_json, right_aligned};
 use crate::error::{Error, Result};
 use crate::files::new_folder::NewFolder;
 use crate::report::charts::map;
 use crate::report::pages::sweep::{self, COLUMNS, Sweep, SweepPoint, Swept};
 use crate::simulator::trial::trajectory::write_trajectories;
-use crate::simulator::{DriveOptions, Track};
+use crate::simulator::{DriveOptions, Leg, Track, Wheel, drive_legs};
 
 /// What a sweep prints with `--json`.
 #[derive(Serialize)]
@@ -35,7 +36,7 @@ impl<'a> Report<'a> {
 }
 
 /// Drives at each of the `values` of what is swept; `options` say the rest.
-pub fn run(args: &DriveArgs, track: &Track, options: &DriveOptions, swept: Swept, values: &[f64]) -> Result<()> {
+pub fn run(args: &DriveArgs, track: &Arc<Track>, options: &DriveOptions, swept: Swept, values: &[f64]) -> Result<()> {
     let drives = drives(options, swept, values)?;
     let drivers: Vec<&str> = std::iter::once(args.model.as_str()).chain(args.against.as_deref()).collect();
     let wheels = drivers.iter().map(|name| args.wheel(name)).collect::<Result<Vec<Wheel>>>()?;
@@ -44,32 +45,39 @@ pub fn run(args: &DriveArgs, track: &Track, options: &DriveOptions, swept: Swept
     let stop = stop_on_ctrl_c()?;
     let pool = pool(args.threads)?;
     let (mut sweeps, mut ended) = (Vec::new(), false);
-    'all: for (number, (wheel, driver)) in wheels.iter().zip(&drivers).enumerate() {
+    for (number, (wheel, driver)) in wheels.iter().zip(&drivers).enumerate() {
+        let legs = drives.iter().map(|(_, options)| Leg { track: track.clone(), options: options.clone() }).collect();
+        let mut bar = ShareBar::new(format!("{driver} on {}", track.name()), &stop);
+        let results = match pool.install(|| drive_legs(wheel, legs, false, &mut bar)) {
+            Ok((results, stopped)) => {
+                ended = stopped;
+                results
+            }
+            Err(Error::Interrupted) => {
+                ended = true;
+                break;
+            }
+            Err(error) => return Err(error),
+        };
+        drop(bar);
         let mut points = Vec::new();
-        for (value, options) in &drives {
-            let value = *value;
-            let name = format!("{driver}, {}", swept.value(value));
-            let result = match pool.install(|| wheel.drive(track, options, &name, None, &stop, None)) {
-                Ok((result, false)) => result,
-                // What is whole is kept.
-                Ok((_, true)) | Err(Error::Interrupted) => {
-                    ended = true;
-                    if !points.is_empty() {
-                        sweeps.push(Sweep { driver: driver.to_string(), swept, points });
-                    }
-                    break 'all;
-                }
-                Err(error) => return Err(error),
-            };
+        // What is whole is kept.
+        let whole = results.into_iter().take_while(|result| result.complete).filter_map(|result| result.drive);
+        for (result, (value, _)) in whole.zip(&drives) {
             if let Some(folder) = &folder {
-                let name = format!("{}{}", if number == 0 { "" } else { "against-" }, swept.value(value));
+                let name = format!("{}{}", if number == 0 { "" } else { "against-" }, swept.value(*value));
                 let of_value = NewFolder::create(&folder.unfinished().join(name.replace(' ', "-")))?;
                 map::write(track, &result, &of_value)?;
                 write_trajectories(&result, of_value)?;
             }
-            points.push(SweepPoint { value, drive: result.summary });
+            points.push(SweepPoint { value: *value, drive: result.summary });
         }
-        sweeps.push(Sweep { driver: driver.to_string(), swept, points });
+        if !points.is_empty() {
+            sweeps.push(Sweep { driver: driver.to_string(), swept, points });
+        }
+        if ended {
+            break;
+        }
     }
     if sweeps.is_empty() {
         return stop_or_ok(ended);

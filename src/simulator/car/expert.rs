@@ -38,7 +38,7 @@ const TOLERATED: f64 = 0.05;
 const KEYBOARD_LOOK_AHEAD_M: f64 = 11.0;
 
 /// How the expert moves the wheel.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 pub enum Style {
     /// The pursuit's own steering.
     #[default]

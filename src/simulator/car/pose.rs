@@ -3,7 +3,7 @@
 use crate::simulator::math::Vec3;
 
 /// The body of the car in the world: where it stands and its axes (unit, perpendicular).
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct BodyPose {
     /// Middle of the car, on the ground.
     pub origin: Vec3,

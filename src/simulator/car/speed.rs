@@ -34,7 +34,7 @@ pub enum Pace {
 }
 
 /// The speed a drive aims at.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub enum Speed {
     /// The same everywhere, mph.
     Fixed(f64),

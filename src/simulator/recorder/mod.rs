@@ -2,6 +2,7 @@
 
 pub mod expert_drive;
 pub mod options;
+pub(crate) mod photograph;
 pub mod record;
 pub mod sample;
 pub mod writer;

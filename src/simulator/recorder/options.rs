@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::Path;
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use crate::dataset::EXPERT_AHEAD_M;
 use crate::geometry::CarGeometry;
@@ -19,7 +19,7 @@ use crate::{Error, Result};
 pub const RECORD_HZ: u64 = 10;
 
 /// How the log is written.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub enum LogFormat {
     /// As Udacity's sample data: a header, `", "` between fields, paths relative to the log.
     #[default]
@@ -29,7 +29,7 @@ pub enum LogFormat {
 }
 
 /// What to record.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct RecordOptions {
     /// Laps of normal driving, or with `recovery` laps along which the car is put off its line.
     pub laps: f64,

@@ -3,7 +3,7 @@
 use crate::simulator::car::pose::BodyPose;
 
 /// One row of the log before its pictures are taken.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct Sample {
     /// Simulated time, s.
     pub time_s: f64,

@@ -20,7 +20,6 @@ use crate::{Error, Result};
 pub(crate) struct Photographer {
     eye: Eye,
     has_sides: bool,
-    bytes: Vec<u8>,
 }
 
 /// Whether there are side cameras on `car`, or on the simulator's own.
@@ -31,20 +30,27 @@ pub(crate) fn has_sides(car: Option<&CarGeometry>) -> bool {
 impl Photographer {
     /// With the cameras of `car`, or those of the simulator's own.
     pub fn new(car: Option<&CarGeometry>) -> Photographer {
-        Photographer { eye: Eye::new(car), has_sides: has_sides(car), bytes: Vec::new() }
+        Photographer { eye: Eye::new(car), has_sides: has_sides(car) }
     }
 
-    /// Writes the pictures of all cameras into the folder `images`.
-    pub fn take(&mut self, world: &World, variant: &Variant, sample: &Sample, images: &Path) -> Result<()> {
-        for mount in mounts(self.has_sides) {
-            let frame = self.eye.see(world, variant, &sample.body, *mount);
-            self.bytes.clear();
-            jpeg::encode(frame, &mut self.bytes)?;
-            let path = images.join(image_name(*mount, sample.time_s));
-            fs::write(&path, &self.bytes).map_err(Error::io(&path))?;
-        }
-        Ok(())
+    /// The pictures of all cameras as JPEG files, in their order.
+    pub fn take(&mut self, world: &World, variant: &Variant, sample: &Sample) -> Result<Vec<Vec<u8>>> {
+        let picture = |mount: &Mount| {
+            let mut bytes = Vec::new();
+            jpeg::encode(self.eye.see(world, variant, &sample.body, *mount), &mut bytes)?;
+            Ok(bytes)
+        };
+        mounts(self.has_sides).iter().map(picture).collect()
     }
+}
+
+/// Writes the `pictures` that were taken at the simulated time `time_s` into the folder `images`.
+pub(crate) fn write_pictures(pictures: &[Vec<u8>], time_s: f64, images: &Path) -> Result<()> {
+    for (mount, bytes) in Mount::ALL.iter().zip(pictures) {
+        let path = images.join(image_name(*mount, time_s));
+        fs::write(&path, bytes).map_err(Error::io(&path))?;
+    }
+    Ok(())
 }
 
 /// The cameras in the order of the log's columns; the centre camera is the first.
@@ -152,7 +158,8 @@ impl<'a> RowWriter<'a> {
     /// # Errors
     /// If something cannot be written. The rows before stay whole.
     pub fn write(&mut self, sample: &Sample) -> Result<()> {
-        self.photographer.take(self.world, &self.variant, sample, &self.images)?;
+        let pictures = self.photographer.take(self.world, &self.variant, sample)?;
+        write_pictures(&pictures, sample.time_s, &self.images)?;
         self.text.clear();
         let written = self.lines.row(sample, &mut self.text).and_then(|()| self.file.write_all(&self.text));
         if let Err(source) = written {

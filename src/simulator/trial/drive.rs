@@ -7,8 +7,6 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::calm::Calm;
-use crate::cluster::tasks::{help, spread};
-use crate::cluster::{Claim, Team};
 use crate::observer::{Observer, Progress, Tally};
 use crate::simulator::track::Track;
 use crate::simulator::trial::driver::{Driver, Expert};
@@ -33,11 +31,11 @@ pub fn drive<F>(
 where
     F: Fn() -> Result<Box<dyn Driver>> + Sync,
 {
-    require_all(drive_as_far(track, new_driver, options, observer, None)?)
+    require_all(drive_as_far(track, new_driver, options, observer)?)
 }
 
 /// As [`drive`]; but if the observer ends it with [`Error::Interrupted`], the result of the seeds that were driven until then, if there
-/// are any. Also whether it was ended so. With a `claim` other ranks, which call [`help_drive`], take their share of the seeds.
+/// are any. Also whether it was ended so.
 ///
 /// # Errors
 /// As [`drive`].
@@ -46,50 +44,31 @@ pub fn drive_as_far<F>(
     new_driver: F,
     options: &DriveOptions,
     observer: &mut (dyn Observer<Progress> + Send),
-    claim: Option<&Claim>,
 ) -> Result<(DriveResult, bool)>
 where
     F: Fn() -> Result<Box<dyn Driver>> + Sync,
 {
     options.check()?;
+    if new_driver()?.needs_frame() {
+        // Built within a seed, by many threads, it could wait for a thread that has begun another seed meanwhile and waits for it.
+        track.world();
+    }
     let (tally, stopped) = (Tally::new(options.runs, observer), AtomicBool::new(false));
-    let has_stopped = || stopped.load(Ordering::Relaxed);
     // Whatever ends one seed ends the drive.
     let stop = |_: &Error| stopped.store(true, Ordering::Relaxed);
-    let told = |measured: Result<Measured>| -> Result<Measured> {
-        let measured = measured.inspect_err(stop)?;
+    let seed = |k: usize| {
+        if stopped.load(Ordering::Relaxed) {
+            return Err(Error::Interrupted);
+        }
+        let measured = measure(track, &new_driver, options, k as u64, None).inspect_err(stop)?;
         match tally.add(1).inspect_err(stop) {
             Ok(()) | Err(Error::Interrupted) => Ok(measured),
             Err(error) => Err(error),
         }
     };
-    let seed = |k: usize| told(measure(track, &new_driver, options, k as u64, None));
-    let measured: Vec<Result<Measured>> = match claim {
-        None => {
-            let unless_stopped = |k| if has_stopped() { Err(Error::Interrupted) } else { seed(k) };
-            (0..options.runs).into_par_iter().map(unless_stopped).collect()
-        }
-        Some(claim) => spread(claim, options.runs, seed, |bytes| told(Measured::of_bytes(bytes)), has_stopped),
-    };
+    let measured: Vec<Result<Measured>> = (0..options.runs).into_par_iter().map(seed).collect();
     let result = put_together(track, options, measured, rayon::current_num_threads())?;
     Ok((result, stopped.into_inner()))
-}
-
-/// Another rank than 0: drives the seeds that rank 0 hands out in [`drive_as_far`], with what is `prepared`: track, options, and what
-/// makes a driver. If that could not be prepared, rank 0 hears why.
-///
-/// # Errors
-/// That of `prepared`.
-pub fn help_drive<F>(team: &dyn Team, prepared: Result<(Track, DriveOptions, F)>) -> Result<()>
-where
-    F: Fn() -> Result<Box<dyn Driver>> + Sync + Send,
-{
-    help(
-        team,
-        prepared.map(|(track, options, new_driver)| {
-            move |k: usize| measure(&track, &new_driver, &options, k as u64, None)?.to_bytes()
-        }),
-    )
 }
 
 /// The result, if all seeds were driven.
@@ -140,25 +119,15 @@ where
 
 /// The measurements of one seed.
 #[derive(Serialize, Deserialize)]
-struct Measured {
+pub(crate) struct Measured {
     pair: TrialPair,
     expert: Trial,
     simulated_s: f64,
     busy_s: f64,
 }
 
-impl Measured {
-    fn to_bytes(&self) -> Result<Vec<u8>> {
-        serde_json::to_vec(self).map_err(|e| Error::Fault(format!("a drive cannot be sent: {e}")))
-    }
-
-    fn of_bytes(bytes: &[u8]) -> Result<Measured> {
-        serde_json::from_slice(bytes).map_err(|e| Error::Fault(format!("a drive of another rank cannot be read: {e}")))
-    }
-}
-
 /// Drives the `k`-th seed free, assisted, and with the expert.
-fn measure<F>(
+pub(crate) fn measure<F>(
     track: &Track,
     new_driver: &F,
     options: &DriveOptions,
@@ -199,7 +168,7 @@ where
 /// # Errors
 ///
 /// [`Error::Interrupted`] if none was driven; any other error of a seed.
-fn put_together(
+pub(crate) fn put_together(
     track: &Track,
     options: &DriveOptions,
     results: Vec<Result<Measured>>,
@@ -395,7 +364,7 @@ mod tests {
         let options = DriveOptions { runs: 4, seed: 3, ..Default::default() };
         let all = drive(&track, make, &options, &mut Unobserved).unwrap();
         let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
-        let (far, stopped) = pool.install(|| drive_as_far(&track, make, &options, &mut Stopping(2), None)).unwrap();
+        let (far, stopped) = pool.install(|| drive_as_far(&track, make, &options, &mut Stopping(2))).unwrap();
         assert!(stopped && far.trials == all.trials[..2] && far.summary.runs == 2 && far.summary.laps_total == 2);
         let (far, stopped) = drive_observed_as_far(&track, make, &options, &mut Stopping(1)).unwrap();
         assert!(stopped && far.trials == all.trials[..2]);

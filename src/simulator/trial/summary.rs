@@ -8,7 +8,7 @@ use crate::simulator::trial::outcome::{Trial, TrialOptions};
 use crate::{Error, Result};
 
 /// How a driver is put to the test.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct DriveOptions {
     /// Laps of each trial.
     pub laps: usize,

@@ -8,6 +8,9 @@ use crate::picture::RgbImage;
 use rayon::prelude::*;
 use std::sync::OnceLock;
 
+/// Thumbnails are sent in pieces hardly longer than this.
+const PIECE_BYTES: usize = 1 << 20;
+
 impl Loader {
     /// How many frames of this (validation) loader have a near twin in `training`. Frames are known once they, or those of the other
     /// cameras beside them, were shown, so this is to be asked after the first epoch.
@@ -56,17 +59,24 @@ impl Loader {
         );
     }
 
-    /// What the audit of near twins knows of the pictures that were decoded so far, for [`take_thumbnails`](Loader::take_thumbnails).
-    pub fn thumbnails(&self) -> Vec<u8> {
+    /// Gives `piece` all that the audit of near twins knows of the pictures that were decoded so far, in pieces for
+    /// [`take_thumbnails`](Loader::take_thumbnails).
+    pub fn thumbnails(&self, mut piece: impl FnMut(&[u8])) {
         let known =
             self.thumbnails.iter().enumerate().filter_map(|(picture, thumbnail)| Some((picture, thumbnail.get()?)));
         let mut bytes = Vec::new();
         for (picture, thumbnail) in known {
+            if bytes.len() > PIECE_BYTES {
+                piece(&bytes);
+                bytes.clear();
+            }
             bytes.extend((picture as u32).to_le_bytes());
             bytes.push(u8::from(thumbnail.is_some()));
             bytes.extend(thumbnail.iter().flat_map(|thumbnail| thumbnail.cells()));
         }
-        bytes
+        if !bytes.is_empty() {
+            piece(&bytes);
+        }
     }
 
     /// Takes over what another process knows of the same pictures.

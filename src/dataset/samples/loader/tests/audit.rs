@@ -58,7 +58,7 @@ fn of_a_long_side_the_audit_looks_at_one_row_in_several() {
     // Another process that is told of the pictures counts the same.
     let mut other = Loader::training(&recordings, &targets, &split, &spec).unwrap();
     other.compared_every = 3;
-    other.take_thumbnails(&training.thumbnails());
+    training.thumbnails(|piece| other.take_thumbnails(piece));
     assert_eq!(validation.near_twins(&other), twins);
 }
 

@@ -3,13 +3,11 @@
 use std::process::ExitCode;
 use std::sync::Arc;
 
-use clap::Parser;
-
 use super::process::{pool, stop_on_ctrl_c};
-use super::{Cli, Command, drive};
-use crate::cluster::{Order, Team, await_order};
+use crate::cluster::tasks::{Work, take_part};
+use crate::cluster::{Order, Team, await_bytes, await_order};
 use crate::error::{Error, Result};
-use crate::training;
+use crate::{evaluation, simulator, training};
 
 /// Follows rank 0.
 pub(super) fn run(team: &Arc<dyn Team>) -> ExitCode {
@@ -20,6 +18,16 @@ pub(super) fn run(team: &Arc<dyn Team>) -> ExitCode {
         Err(_) => ExitCode::FAILURE,
     }
 }
+
+/// Takes part in a piece of work of which rank 0 has sent these bytes.
+type TakePart = fn(&dyn Team, Result<&[u8]>) -> Result<()>;
+
+/// The kinds of work, by name.
+const WORK: [(&str, TakePart); 3] = [
+    (simulator::Drives::NAME, take_part::<simulator::Drives>),
+    (simulator::Photographs::NAME, take_part::<simulator::Photographs>),
+    (evaluation::Answers::NAME, take_part::<evaluation::Answers>),
+];
 
 fn follow(team: &Arc<dyn Team>) -> Result<()> {
     // Rank 0 hears of Ctrl-C itself.
@@ -34,15 +42,15 @@ fn follow(team: &Arc<dyn Team>) -> Result<()> {
                     Err(error) => training::take_part(team, Err(error), &stop),
                 };
             }
-            Order::Drive { arguments, against, fingerprint, threads } => {
-                let args = match Cli::try_parse_from(arguments) {
-                    Ok(Cli { command: Command::Drive(args) }) => Ok(args),
-                    _ => Err(Error::Fault("the arguments of rank 0 cannot be read".into())),
-                };
-                let help = |args| drive::help(&**team, args, against, &fingerprint);
-                ended = match (args, pool(threads)) {
-                    (Ok(args), Ok(pool)) => pool.install(|| help(Ok(&args))),
-                    (Err(error), _) | (_, Err(error)) => help(Err(error)),
+            Order::Work { name, threads } => {
+                let bytes = await_bytes(&**team);
+                let known = WORK.iter().find(|(known, _)| *known == name);
+                let take_part = known
+                    .map(|(_, take_part)| take_part)
+                    .ok_or_else(|| Error::Fault(format!("no rank does {name}")))?;
+                ended = match pool(threads) {
+                    Ok(pool) => pool.install(|| take_part(&**team, Ok(&bytes))),
+                    Err(error) => take_part(&**team, Err(error)),
                 };
             }
             Order::End => return ended,
