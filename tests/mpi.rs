@@ -103,10 +103,9 @@ fn any_number_of_ranks_trains_the_weights_of_one_process() {
     }
 }
 
-/// A run of two ranks that has saved something; the launcher gives them `patience` seconds to end after a signal.
-fn begun(folder: &Path, args: &[&str], out: &str, patience: &str) -> Child {
+/// A run of two ranks that has saved something.
+fn begun(folder: &Path, args: &[&str], out: &str) -> Child {
     let mut job = mpirun(folder, 2);
-    let job = job.args(["--mca", "odls_base_sigkill_timeout", patience]);
     let job = job.arg(env!("CARGO_BIN_EXE_steersman")).args(args).args(["--out", out]);
     let job = job.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
     let deadline = Instant::now() + Duration::from_secs(120);
@@ -117,10 +116,10 @@ fn begun(folder: &Path, args: &[&str], out: &str, patience: &str) -> Child {
     job
 }
 
-/// What `job` says after process `to` has had `signal`; it must end with an error, and soon.
-fn signalled(job: Child, signal: &str, to: u32) -> String {
+/// What `job` says after the processes `to` have had `signal`; it must end with an error, and soon.
+fn signalled(job: Child, signal: &str, to: &[u32]) -> String {
     let sent = Instant::now();
-    assert!(Command::new("kill").args([signal, &to.to_string()]).status().unwrap().success());
+    assert!(Command::new("kill").arg(signal).args(to.iter().map(u32::to_string)).status().unwrap().success());
     let output = job.wait_with_output().unwrap();
     assert!(sent.elapsed() < Duration::from_secs(20), "it ended after {:?}", sent.elapsed());
     let error = String::from_utf8_lossy(&output.stderr).into_owned();
@@ -142,18 +141,18 @@ fn ranks_end_soon_after_one_is_killed_or_all_are_interrupted_and_any_number_of_t
         assert_eq!(resumed["weights_hash"], alone["weights_hash"], "{out}, {ranks} ranks");
         assert_eq!(resumed["val_mse"], alone["val_mse"], "{out}, {ranks} ranks");
     };
-    let job = begun(folder.path(), &args, "killed", "1");
+    let job = begun(folder.path(), &args, "killed");
     let ranks = children(&job);
     assert_eq!(ranks.len(), 2, "{ranks:?}");
-    let error = signalled(job, "-9", ranks[1]);
+    let error = signalled(job, "-9", &ranks[1..]);
     assert!(error.contains("signal 9"), "{error}");
     run_copy(folder.path(), "killed", "killed-too");
     resumed("killed", 1);
     resumed("killed-too", 3);
-    // Ctrl-C in the terminal. A second, as the launcher gives by itself, is not enough on a busy machine.
-    let job = begun(folder.path(), &args, "interrupted", "5");
-    let launcher = job.id();
-    let error = signalled(job, "-INT", launcher);
+    // What launchers send at Ctrl-C, and Slurm before the time is over.
+    let job = begun(folder.path(), &args, "interrupted");
+    let ranks = children(&job);
+    let error = signalled(job, "-TERM", &ranks);
     assert!(error.contains("stopped and saved; go on with: steersman train --resume interrupted"), "{error}");
     resumed("interrupted", 2);
 }
