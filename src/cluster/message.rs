@@ -59,12 +59,15 @@ pub fn split(mut bytes: &[u8]) -> Result<Vec<&[u8]>> {
     if bytes.is_empty() { Ok(parts) } else { Err(unreadable("it is cut off")) }
 }
 
+/// The first `N` parts of a message, and all others.
+pub type Parts<'a, const N: usize> = ([&'a [u8]; N], Vec<&'a [u8]>);
+
 /// The first `N` parts of what [`join`] made, and all others.
 ///
 /// # Errors
 ///
 /// As [`split`], also for fewer parts.
-pub fn split_first<const N: usize>(bytes: &[u8]) -> Result<([&[u8]; N], Vec<&[u8]>)> {
+pub fn split_first<const N: usize>(bytes: &[u8]) -> Result<Parts<'_, N>> {
     let mut parts = split(bytes)?;
     if parts.len() < N {
         return Err(unreadable("it has too few parts"));
