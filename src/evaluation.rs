@@ -232,9 +232,11 @@ impl Teller<'_> {
 
 /// The answers for the centre pictures of all rows, each with its row; rows whose picture cannot be decoded are left out.
 fn answers(pilot: &Pilot, recording: &Recording, tell: &Teller) -> Result<Vec<(usize, Answer)>> {
+    // A few tasks for each thread, so that all end together.
+    let of_task = (recording.rows.len() / (4 * rayon::current_num_threads())).clamp(1, TASK_PICTURES);
     let rows = |number: usize| {
-        let first = number * TASK_PICTURES;
-        first..recording.rows.len().min(first + TASK_PICTURES)
+        let first = number * of_task;
+        first..recording.rows.len().min(first + of_task)
     };
     let picture = |row: usize| {
         let mut bytes = Vec::new();
@@ -250,7 +252,7 @@ fn answers(pilot: &Pilot, recording: &Recording, tell: &Teller) -> Result<Vec<(u
         }
         Ok(())
     };
-    let count = recording.rows.len().div_ceil(TASK_PICTURES);
+    let count = recording.rows.len().div_ceil(of_task);
     let task = |number: usize| Ok(Pictures(rows(number).map(picture).collect()));
     run(&Answers(pilot.clone()), count, task, keep).ended?;
     let mut all = all.into_inner().unwrap_or_else(PoisonError::into_inner);

@@ -118,30 +118,6 @@ impl<'a> Tally<'a> {
     }
 }
 
-/// Adds up the progress of parts that are worked on at the same time.
-pub struct Parts<'a> {
-    weights: Vec<f64>,
-    state: Mutex<(Vec<f64>, &'a mut (dyn Observer<Progress> + Send))>,
-}
-
-impl<'a> Parts<'a> {
-    /// Parts that take time in proportion to `weights`.
-    pub fn new(weights: Vec<f64>, observer: &'a mut (dyn Observer<Progress> + Send)) -> Parts<'a> {
-        Parts { state: Mutex::new((vec![0.0; weights.len()], observer)), weights }
-    }
-
-    /// The observer of part `index`.
-    pub fn part(&self, index: usize) -> impl Observer<Progress> + Send + '_ {
-        move |Progress(share): Progress| {
-            let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
-            let (shares, observer) = &mut *state;
-            shares[index] = f64::max(shares[index], share);
-            let done: f64 = shares.iter().zip(&self.weights).map(|(share, weight)| share * weight).sum();
-            observer.observe(Progress(done / self.weights.iter().sum::<f64>()))
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -156,18 +132,7 @@ mod tests {
     }
 
     #[test]
-    fn shares_of_parts_are_weighted_and_errors_reach_whoever_reports() {
-        let mut seen = Vec::new();
-        let mut observer = |Progress(share)| {
-            seen.push(share);
-            if share == 1.0 { Err(Error::Interrupted) } else { Ok(()) }
-        };
-        let parts = Parts::new(vec![3.0, 1.0], &mut observer);
-        assert!(parts.part(0).observe(Progress(0.5)).is_ok());
-        assert!(parts.part(1).observe(Progress(1.0)).is_ok());
-        assert!(parts.part(0).observe(Progress(1.0)).is_err());
-        assert_eq!(seen, [0.375, 0.625, 1.0]);
-
+    fn a_tally_tells_the_share_of_its_items() {
         let mut seen = Vec::new();
         let mut observer = |Progress(share)| {
             seen.push(share);

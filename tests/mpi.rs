@@ -298,6 +298,24 @@ fn a_drive_that_cannot_be_driven_ends_on_all_ranks() {
     }
 }
 
+#[test]
+fn a_drive_ends_soon_after_a_rank_is_killed() {
+    if !is_here() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let args = ["drive", "zero", "--track", "lake", "--runs", "5000", "--out", "driven"];
+    let mut job = mpirun(folder.path(), 2);
+    let job = job.arg(env!("CARGO_BIN_EXE_steersman")).args(args).stdout(Stdio::null()).stderr(Stdio::piped());
+    let job = job.spawn().unwrap();
+    sleep(Duration::from_secs(3));
+    let ranks = children(&job);
+    assert_eq!(ranks.len(), 2, "{ranks:?}");
+    let error = signalled(job, "-9", &ranks[1..]);
+    assert!(error.contains("signal 9"), "{error}");
+    assert!(!folder.path().join("driven").exists());
+}
+
 /// Each rank begins in a folder of its own here, as on machines without a common disk.
 #[test]
 fn a_rank_with_other_recordings_or_another_program_is_named() {

@@ -4,7 +4,7 @@ use std::process::ExitCode;
 use std::sync::Arc;
 
 use super::process::{pool, stop_on_ctrl_c};
-use crate::cluster::tasks::{Work, take_part};
+use crate::cluster::tasks::{Work, decline, take_part};
 use crate::cluster::{Order, Team, await_bytes, await_order};
 use crate::error::{Error, Result};
 use crate::{evaluation, simulator, training};
@@ -35,7 +35,8 @@ fn follow(team: &Arc<dyn Team>) -> Result<()> {
     // Rank 0 hears of an error of work that was done together; what else there is to do it decides.
     let mut ended = Ok(());
     loop {
-        match await_order(&**team)? {
+        // Rank 0 may wait for work to be done.
+        match await_order(&**team).inspect_err(|error| decline(&**team, error))? {
             Order::Train { job, threads } => {
                 ended = match pool(threads) {
                     Ok(pool) => pool.install(|| training::take_part(team, Ok(&job), &stop)),
@@ -44,10 +45,11 @@ fn follow(team: &Arc<dyn Team>) -> Result<()> {
             }
             Order::Work { name, threads } => {
                 let bytes = await_bytes(&**team);
-                let known = WORK.iter().find(|(known, _)| *known == name);
-                let take_part = known
-                    .map(|(_, take_part)| take_part)
-                    .ok_or_else(|| Error::Fault(format!("no rank does {name}")))?;
+                let Some((_, take_part)) = WORK.iter().find(|(known, _)| *known == name) else {
+                    let error = Error::Fault(format!("no rank does {name}"));
+                    decline(&**team, &error);
+                    return Err(error);
+                };
                 ended = match pool(threads) {
                     Ok(pool) => pool.install(|| take_part(&**team, Ok(&bytes))),
                     Err(error) => take_part(&**team, Err(error)),

@@ -5,8 +5,8 @@ use serde::de::DeserializeOwned;
 
 use crate::error::{Error, Result};
 
-/// What can be sent. Everything that serde writes and reads is sent as JSON, whose numbers keep their bits here unless they are no
-/// numbers at all.
+/// What can be sent. Everything that serde writes and reads is sent as JSON, whose numbers keep their bits here as long as they
+/// are finite; others are sent as their bits.
 pub trait Message: Sized {
     /// The bytes to send.
     ///
@@ -25,12 +25,21 @@ pub trait Message: Sized {
 
 impl<T: Serialize + DeserializeOwned> Message for T {
     fn to_bytes(&self) -> Result<Vec<u8>> {
-        serde_json::to_vec(self).map_err(|e| Error::Fault(format!("a message cannot be written: {e}")))
+        written(self)
     }
 
     fn of_bytes(bytes: &[u8]) -> Result<T> {
         serde_json::from_slice(bytes).map_err(|e| unreadable(&e.to_string()))
     }
+}
+
+/// What need not be read as the same type, as JSON.
+///
+/// # Errors
+///
+/// [`Error::Fault`] if it cannot be written.
+pub fn written(value: &impl Serialize) -> Result<Vec<u8>> {
+    serde_json::to_vec(value).map_err(|e| Error::Fault(format!("a message cannot be written: {e}")))
 }
 
 /// `parts`, each behind its length.

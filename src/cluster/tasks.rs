@@ -4,8 +4,9 @@
 //! a task. Rank 0 makes the tasks, takes their results, and works too. All of it travels as bytes: no rank needs a file of another one, and
 //! a task has the same result whoever does it. Where there is but one process, the same functions run without any bytes.
 
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Barrier, Mutex, PoisonError};
 use std::thread;
 use std::time::Duration;
 
@@ -137,10 +138,9 @@ fn run_among<W: Work>(
         if let Some(team) = team {
             scope.spawn(move || serve(team));
         }
-        // Not a parallel iterator: a thread that waits within a task must not begin another one meanwhile.
-        rayon::broadcast(|_| {
+        on_all_threads(|| {
             while let Some(number) = draw() {
-                settle(number, task(number).and_then(|task| work.perform(task)));
+                settle(number, task(number).and_then(|task| performed(work, task)));
             }
         });
     });
@@ -170,19 +170,42 @@ pub fn take_part<W: Work>(team: &dyn Team, work: Result<&[u8]>) -> Result<()> {
             let (kind, number, content) = taken_apart(&answer);
             (kind == TASK).then(|| (number, content.to_vec()))
         };
-        rayon::broadcast(|_| {
+        on_all_threads(|| {
             let mut drawn = ask(put_together(ASKS, 0, &[]));
             while let Some((number, task)) = drawn {
-                let done = W::Task::of_bytes(&task).and_then(|task| work.perform(task)?.to_bytes());
+                let done = W::Task::of_bytes(&task).and_then(|task| performed(&work, task)?.to_bytes());
                 drawn = match done {
                     Ok(done) => ask(put_together(DONE, number, &done)),
                     Err(error) => ask(put_together(FAILED, number, error.to_string().as_bytes())),
                 };
             }
         });
+        rayon::current_num_threads()
     });
-    team.send(0, &put_together(LEAVES, rayon::current_num_threads(), text.as_bytes()));
-    ended
+    // Who has no work has no pool either.
+    team.send(0, &put_together(LEAVES, ended.as_ref().map_or(0, |threads| *threads), text.as_bytes()));
+    ended.map(drop)
+}
+
+/// Another rank than 0: tells rank 0, which waits for it in a [`run`], why it cannot take part.
+pub fn decline(team: &dyn Team, why: &Error) {
+    team.send(0, &put_together(LEAVES, 0, why.to_string().as_bytes()));
+}
+
+/// Runs `work` on each thread of this rayon pool. It is no parallel iterator, and all threads begin together: a thread that waits within a
+/// task must not begin another one meanwhile, which could wait for what the first one holds.
+fn on_all_threads(work: impl Fn() + Sync) {
+    let begin = Barrier::new(rayon::current_num_threads());
+    rayon::broadcast(|_| {
+        begin.wait();
+        work();
+    });
+}
+
+/// Does `task`; a panic is an error too, so that the other tasks end at once.
+fn performed<W: Work>(work: &W, task: W::Task) -> Result<W::Done> {
+    catch_unwind(AssertUnwindSafe(|| work.perform(task)))
+        .unwrap_or_else(|_| Err(Error::Fault(format!("a task of {} panicked", W::NAME))))
 }
 
 fn put_together(kind: u8, number: usize, content: &[u8]) -> Vec<u8> {
@@ -217,6 +240,7 @@ mod tests {
 
         fn perform(&self, task: u64) -> Result<u64> {
             thread::sleep(Duration::from_micros(200));
+            assert!(task != 9 || !self.bad.contains(&9), "a bad nine");
             match self.bad.contains(&task) {
                 true => Err(Error::Input(format!("{task} is bad"))),
                 false => Ok(task * task),
@@ -262,6 +286,15 @@ mod tests {
             assert!(kept[7].is_none() && ran.ended.unwrap_err().to_string().contains("7 is bad"), "{ranks}");
             let (kept, ran) = squares(ranks, &[], |_| Err(Error::Interrupted));
             assert!(kept.iter().any(Option::is_none) && matches!(ran.ended, Err(Error::Interrupted)), "{ranks}");
+        }
+    }
+
+    #[test]
+    fn a_panic_in_a_task_ends_the_work_with_an_error() {
+        for ranks in [1, 3] {
+            let (kept, ran) = squares(ranks, &[9], |_| Ok(()));
+            assert!(kept[9].is_none(), "{ranks}");
+            assert!(ran.ended.unwrap_err().to_string().contains("a task of squares panicked"), "{ranks}");
         }
     }
 

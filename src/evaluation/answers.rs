@@ -10,7 +10,7 @@ use crate::error::{Error, Result};
 use crate::picture::decode::MAX_SIDE;
 use crate::pilot::{Answer, Pilot};
 
-/// Pictures of a task: some, so that a message costs little beside them.
+/// Pictures of a task at most: some, so that a message costs little beside them.
 pub(super) const TASK_PICTURES: usize = 64;
 
 /// The model that answers.

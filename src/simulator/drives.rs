@@ -4,7 +4,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use serde::{Deserialize, Serialize};
 
-use crate::cluster::message::{Message, join, split_first};
+use crate::cluster::message::{Message, join, split_first, written};
 use crate::cluster::tasks::{Ran, Work, run};
 use crate::observer::{Observer, Progress, Tally};
 use crate::pilot::Pilot;
@@ -84,7 +84,7 @@ pub fn drive_legs(
         for done in done.by_ref().take(of_leg.len()) {
             match done {
                 Some(Done::Seed(seed)) => measured.push(Ok(*seed)),
-                Some(Done::Offline(mae_deg)) => offline_mae_deg = Some(mae_deg),
+                Some(Done::Offline(bits)) => offline_mae_deg = Some(f64::from_bits(bits)),
                 None => complete = false,
             }
         }
@@ -158,7 +158,8 @@ impl Task {
 
 #[derive(Serialize, Deserialize)]
 pub(crate) enum Done {
-    Offline(f64),
+    /// The bits of the error, which may be no number.
+    Offline(u64),
     Seed(Box<Measured>),
 }
 
@@ -174,7 +175,9 @@ impl Work for Drives {
                 let new_driver = || Ok(self.wheel.driver());
                 Ok(Done::Seed(Box::new(measure(track, &new_driver, options, k as u64, None)?)))
             }
-            (Task::Offline(_), Some(pilot)) => Ok(Done::Offline(offline_mae_deg(pilot, track, options.seed)?)),
+            (Task::Offline(_), Some(pilot)) => {
+                Ok(Done::Offline(offline_mae_deg(pilot, track, options.seed)?.to_bits()))
+            }
             (Task::Offline(_), None) => Err(Error::Fault("a driver that is no model has no offline error".into())),
         }
     }
@@ -192,14 +195,12 @@ impl Message for Drives {
             }
         }
         let specs: Vec<&TrackSpec> = tracks.iter().map(|track| &track.spec).collect();
-        let written =
-            serde_json::to_vec(&(specs, legs)).map_err(|e| Error::Fault(format!("a drive cannot be sent: {e}")))?;
-        Ok(join([self.wheel.to_bytes()?, written]))
+        Ok(join([self.wheel.to_bytes()?, written(&(specs, legs))?]))
     }
 
     fn of_bytes(bytes: &[u8]) -> Result<Drives> {
-        let ([wheel, written], _) = split_first::<2>(bytes)?;
-        let (specs, legs): (Vec<TrackSpec>, Vec<(usize, DriveOptions)>) = Message::of_bytes(written)?;
+        let ([wheel, legs], _) = split_first::<2>(bytes)?;
+        let (specs, legs): (Vec<TrackSpec>, Vec<(usize, DriveOptions)>) = Message::of_bytes(legs)?;
         let tracks: Vec<Arc<Track>> = specs.into_iter().map(|spec| Arc::new(Track::again(spec))).collect();
         let leg = |(track, options): (usize, DriveOptions)| match tracks.get(track) {
             Some(track) => Ok(Leg { track: track.clone(), options }),
@@ -249,6 +250,13 @@ mod tests {
             assert_eq!(result.drive.unwrap().trials, alone.trials);
             assert_eq!(again.trials, alone.trials);
         }
+    }
+
+    #[test]
+    fn an_error_that_is_no_number_is_sent_as_it_is() {
+        let sent = Done::Offline(f64::NAN.to_bits()).to_bytes().unwrap();
+        let Done::Offline(bits) = Done::of_bytes(&sent).unwrap() else { panic!("no seed was sent") };
+        assert!(f64::from_bits(bits).is_nan());
     }
 
     #[test]

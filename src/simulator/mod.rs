@@ -38,7 +38,7 @@ pub use scenery::light::Variant;
 pub use scenery::world::World;
 pub use track::Track;
 pub use trial::closed_loop::ClosedLoop;
-pub use trial::drive::{compare, drive, drive_as_far, drive_observed, drive_observed_as_far};
+pub use trial::drive::{compare, drive, drive_observed, drive_observed_as_far};
 pub use trial::driver::{DriveState, Driver, DriverAnswer, Expert, InCar, Zero};
 pub use trial::event::{DriveEvent, DriveFrame};
 pub use trial::outcome::{Failure, Trial, TrialOptions};

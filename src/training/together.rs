@@ -10,6 +10,7 @@ use super::checkpoint::State;
 use super::data::Data;
 use super::run::TrainingRun;
 use super::run_folder::{RunFolder, RunInfo};
+use crate::cluster::message::written;
 use crate::cluster::{self, Claim, Order, Team, agree};
 use crate::dataset::loader::{Batch, Loader};
 use crate::engine::network::share;
@@ -64,8 +65,7 @@ impl Together {
         if let Some(team) = self.team.as_ref().filter(|_| !complete) {
             // All ranks leave out what one of them could not decode, and so have batches of the same size.
             self.meet(loader.make_whole(out).map(|()| true), Ok(()))?;
-            let told = serde_json::to_vec(&loader.losses(out)).map_err(|e| Error::Fault(e.to_string()));
-            let losses = team.gather_bytes(&agree(&**team, told)?);
+            let losses = team.gather_bytes(&agree(&**team, written(&loader.losses(out)))?);
             let read = losses.iter().try_for_each(|bytes| {
                 let losses = serde_json::from_slice(bytes).map_err(|e| Error::Fault(e.to_string()))?;
                 loader.take_losses(out, losses);

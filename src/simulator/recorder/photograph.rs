@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use crate::cluster::message::{Message, join, split_first};
+use crate::cluster::message::{Message, join, split_first, written};
 use crate::cluster::tasks::Work;
 use crate::simulator::recorder::expert_drive::drive_and_label;
 use crate::simulator::recorder::options::RecordOptions;
@@ -101,15 +101,14 @@ impl Recent {
 impl Message for Photographs {
     fn to_bytes(&self) -> Result<Vec<u8>> {
         let share = self.driver.as_ref().map(|(_, share)| share);
-        let written = serde_json::to_vec(&(&self.tracks, &self.recordings, share))
-            .map_err(|e| Error::Fault(format!("a recording cannot be sent: {e}")))?;
+        let common = written(&(&self.tracks, &self.recordings, share))?;
         let wheel = self.driver.as_ref().map(|(wheel, _)| wheel.to_bytes()).transpose()?;
-        Ok(join([written].into_iter().chain(wheel)))
+        Ok(join([common].into_iter().chain(wheel)))
     }
 
     fn of_bytes(bytes: &[u8]) -> Result<Photographs> {
-        let ([written], wheel) = split_first::<1>(bytes)?;
-        let (tracks, recordings, share): (_, _, Option<f64>) = Message::of_bytes(written)?;
+        let ([common], wheel) = split_first::<1>(bytes)?;
+        let (tracks, recordings, share): (_, _, Option<f64>) = Message::of_bytes(common)?;
         let wheel = wheel.first().map(|wheel| Wheel::of_bytes(wheel)).transpose()?;
         Ok(Photographs { tracks, recordings, driver: wheel.zip(share), recent: Recent::default() })
     }
@@ -119,8 +118,7 @@ impl Message for Album {
     fn to_bytes(&self) -> Result<Vec<u8>> {
         let taken = self.0.iter().map(|Taken { recording, first, rows, pictures }| {
             let head = (recording, first, rows, pictures.iter().map(Vec::len).collect::<Vec<usize>>());
-            let head = serde_json::to_vec(&head).map_err(|e| Error::Fault(format!("pictures cannot be sent: {e}")))?;
-            Ok(join([&head].into_iter().chain(pictures.iter().flatten())))
+            Ok(join([&written(&head)?].into_iter().chain(pictures.iter().flatten())))
         });
         Ok(join(taken.collect::<Result<Vec<_>>>()?))
     }

@@ -22,7 +22,7 @@ use crate::simulator::track::Track;
 use crate::simulator::trial::wheel::Wheel;
 use crate::{Error, Result};
 
-/// Fewest and most rows of a task: some pictures, so that the message costs little beside them, and so many that several ranks seldom
+/// Rows of a task that are aimed at, fewest and most: some pictures, so that the message costs little beside them, and so many that several ranks seldom
 /// need the same visible world.
 const TASK_ROWS: Range<usize> = 32..256;
 /// Tasks that are wanted.

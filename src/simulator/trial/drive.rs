@@ -39,7 +39,7 @@ where
 ///
 /// # Errors
 /// As [`drive`].
-pub fn drive_as_far<F>(
+fn drive_as_far<F>(
     track: &Track,
     new_driver: F,
     options: &DriveOptions,
@@ -92,7 +92,8 @@ where
     require_all(drive_observed_as_far(track, new_driver, options, observer)?)
 }
 
-/// As [`drive_observed`], but with what was driven when the observer ends it, as in [`drive_as_far`].
+/// As [`drive_observed`]; but if the observer ends it with [`Error::Interrupted`], the result of the seeds that were driven until then, if
+/// there are any. Also whether it was ended so.
 ///
 /// # Errors
 /// As [`drive_observed`].

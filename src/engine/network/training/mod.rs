@@ -26,8 +26,6 @@ use ndarray::Axis;
 use rayon::prelude::*;
 use steersman_kernels::{Isa, update};
 
-#[cfg(test)]
-pub(super) use planning::{GROUP_LIMITS, GroupLimits};
 pub use ranks::Ranks;
 pub use shard_tree::share;
 pub use step_input::StepInput;
@@ -290,3 +288,6 @@ impl TrainingPlan {
         );
     }
 }
+
+#[cfg(test)]
+pub(super) use planning::{GROUP_LIMITS, GroupLimits};

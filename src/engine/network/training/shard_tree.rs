@@ -9,8 +9,8 @@ use std::ops::Range;
 /// Upper limit of the shards of a batch: enough to keep 64 threads busy.
 pub(super) const MAX_SHARDS: usize = 64;
 
-/// A larger batch has more shards and not larger ones, as long as there are fewer than [`MAX_SHARDS`]. A batch of fewer images than
-/// 16 times this has 16 shards. The weight gradient of a convolution wants some images in a call.
+/// A larger batch has more shards and not larger ones, as long as there are fewer than [`MAX_SHARDS`]. A batch of at most 16 times as many
+/// images has up to 16 shards. The weight gradient of a convolution wants some images in a call.
 const SHARD_IMAGES: usize = 8;
 const FEW_SHARDS: usize = 16;
 
