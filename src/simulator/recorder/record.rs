@@ -22,8 +22,8 @@ use crate::simulator::track::Track;
 use crate::simulator::trial::wheel::Wheel;
 use crate::{Error, Result};
 
-/// Rows of a task that are aimed at, fewest and most: some pictures, so that the message costs little beside them, and so many that several ranks seldom
-/// need the same visible world.
+/// Rows of a task that are aimed at, fewest and most: some pictures, so that the message costs little beside them, and so many that
+/// several ranks seldom need the same visible world.
 const TASK_ROWS: Range<usize> = 32..256;
 /// Tasks that are wanted.
 const TASKS: usize = 64;
@@ -179,7 +179,8 @@ fn make(
         Some(folder) => folder.explain(error),
         None => error,
     };
-    let keep = |taken: Taken| -> Result<()> {
+    // Answers whether the recording has all its rows now.
+    let keep = |taken: Taken| -> Result<bool> {
         let Taken { recording, first, rows, pictures } = taken;
         let images = lock(recording).images.clone();
         let mut of_rows = rows.iter().zip(&pictures);
@@ -189,7 +190,7 @@ fn make(
             unfinished.wanted = rows.len();
         }
         unfinished.rows.extend(rows.into_iter().enumerate().map(|(k, row)| (first + k, row)));
-        if unfinished.rows.len() < unfinished.wanted { Ok(()) } else { finish(&requests[recording], &mut unfinished) }
+        Ok(unfinished.rows.len() == unfinished.wanted)
     };
     let tally = Tally::new(tasks, observer);
     let ran = run(
@@ -197,11 +198,19 @@ fn make(
         tasks,
         |number| Ok(task(number)),
         |_, album| {
+            let mut whole = Vec::new();
             for taken in album.0 {
                 let recording = taken.recording;
-                keep(taken).map_err(|error| explained(recording, error))?;
+                if keep(taken).map_err(|error| explained(recording, error))? {
+                    whole.push(recording);
+                }
             }
-            tally.add(1)
+            // Who is stopped here leaves nothing behind.
+            tally.add(1)?;
+            whole.into_iter().try_for_each(|recording| {
+                let finished = finish(&requests[recording], &mut lock(recording));
+                finished.map_err(|error| explained(recording, error))
+            })
         },
     );
     ran.ended?;
