@@ -36,10 +36,11 @@
 //! layer, and four), latency `l`, and `v` bytes sent (see above) at `w` bytes a second. `train --profile` gives `a`, `d` and `u`, and the notice
 //! at the end `v` and the time for meetings. A batch keeps at most `S` cores busy, so many cores want large batches.
 //!
-//! With `hyper` on two cores (AVX-512) `a` is 1.08 ms, `d` 0.18 ms, `u` 1.6 ms and `m` 16, and `v` was counted as 1.07 MB on 2 ranks and 1.57 MB on 4. These
-//! are CPU times and counts; on one busy machine 1, 2 and 4 ranks of one thread trained 765, 1,169 and 970 images/s, and the rank that waited least
-//! spent 5 % of the time of its steps on meetings with 2 ranks and 21 % with 4, twice as many as cores (`default`: 7 and 34 %). So the gradient's
-//! exchange leaves little to overlap where each rank has a core.
+//! With `hyper` on two cores (AVX-512) `a` is 1.08 ms, `d` 0.18 ms, `u` 1.6 ms and `m` 16, from `--profile` of one process, and `v` was counted as
+//! 1.07 MB on 2 ranks and 1.57 MB on 4. On one busy machine 1, 2 and 4 ranks of one thread trained 765, 1,169 and 970 images/s, and the rank
+//! that waited least spent 5 % of the time of its steps on meetings with 2 ranks and 21 % with 4, twice as many as cores (`default`: 7 and 34 %).
+//! Waiting for slower ranks is in that, so it is the most that an overlap with the backward pass could win. For 2 ranks the formula gives 1,552
+//! images/s: it does not know of ranks that wait for a core.
 //!
 //! What follows is a prediction and no measurement: images/s of `hyper` at its batch of 384 (48 shards) on 8 machines, with assumed networks of
 //! `l` = 50, 20 and 5 us and `w` = 0.11, 1.1 and 11 GB/s, beside the same formula for one machine:
