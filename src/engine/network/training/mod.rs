@@ -76,7 +76,7 @@ pub struct TrainingPlan {
 }
 
 impl TrainingPlan {
-    /// The same, where the loss is the mean over the images of the losses of all outputs, that of output `k` times `weights[k]`.
+    /// This plan, where the loss is the mean over the images of the losses of all outputs, that of output `k` times `weights[k]`.
     /// Without weights each counts 1 / outputs.
     ///
     /// # Panics
@@ -88,7 +88,7 @@ impl TrainingPlan {
         self
     }
 
-    /// The same, for the share of one of several processes that train together.
+    /// This plan, for the share of one of several processes that train together.
     pub fn with_ranks(mut self, ranks: Arc<dyn Ranks>) -> TrainingPlan {
         self.set_ranks(ranks);
         self
