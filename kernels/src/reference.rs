@@ -2,6 +2,7 @@
 //!
 //! Names, arguments and layouts are those of the kernels, without the [`crate::Isa`]; sums are taken in `f64`.
 
+use crate::blur::BlurShape;
 use crate::conv_shape::ConvShape;
 use crate::matrix::{Matrix, MatrixMut};
 use crate::pool::PoolShape;
@@ -140,18 +141,36 @@ fn blur_weight(s: &PoolShape, k: usize) -> f64 {
     along(s.kh, k / s.kw) * along(s.kw, k % s.kw)
 }
 
+/// For each position of the maps with their padding, the index in the maps; `None` in the padding.
+fn unpadded(s: &BlurShape, n: usize) -> Vec<Option<usize>> {
+    let (map, padded) = (s.windows, s.padded());
+    let position = |i: usize| {
+        let y = (i / padded.w % padded.h).checked_sub(s.pad_h).filter(|y| *y < map.h)?;
+        let x = (i % padded.w).checked_sub(s.pad_w).filter(|x| *x < map.w)?;
+        Some((i / (padded.h * padded.w) * map.h + y) * map.w + x)
+    };
+    (0..n * map.c * padded.h * padded.w).map(position).collect()
+}
+
 /// See [`crate::blur::blur_forward`].
-pub fn blur_forward(s: &PoolShape, n: usize, x: &[f32], y: &mut [f32]) {
-    for_each_window(s, n, |window, o| {
-        y[o] = window.iter().enumerate().map(|(k, &i)| blur_weight(s, k) * f64::from(x[i])).sum::<f64>() as f32;
+pub fn blur_forward(s: &BlurShape, n: usize, x: &[f32], y: &mut [f32]) {
+    let index = unpadded(s, n);
+    for_each_window(&s.padded(), n, |window, o| {
+        let value = |i: usize| index[i].map_or(0.0, |i| f64::from(x[i]));
+        y[o] = window.iter().enumerate().map(|(k, &i)| blur_weight(&s.windows, k) * value(i)).sum::<f64>() as f32;
     });
 }
 
 /// See [`crate::blur::blur_backward`].
-pub fn blur_backward(s: &PoolShape, n: usize, dy: &[f32], dx: &mut [f32]) {
+pub fn blur_backward(s: &BlurShape, n: usize, dy: &[f32], dx: &mut [f32]) {
     dx.fill(0.0);
-    for_each_window(s, n, |window, o| {
-        window.iter().enumerate().for_each(|(k, &i)| dx[i] += (blur_weight(s, k) * f64::from(dy[o])) as f32);
+    let index = unpadded(s, n);
+    for_each_window(&s.padded(), n, |window, o| {
+        for (k, &i) in window.iter().enumerate() {
+            if let Some(i) = index[i] {
+                dx[i] += (blur_weight(&s.windows, k) * f64::from(dy[o])) as f32;
+            }
+        }
     });
 }
 

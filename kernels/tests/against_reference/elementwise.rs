@@ -135,18 +135,54 @@ fn pooling_agrees_with_the_loops() {
                 reference::average_forward(&shape, n, &x, &mut expected);
                 pool::average_forward(isa, &shape, n, &x, &mut actual);
                 failures.compare(&format!("average_forward {what}"), &actual, &expected, 1e-6);
-                let (mut expected, mut actual, mut row) = (nans(n * y_len), nans(n * y_len), nans(w));
-                reference::blur_forward(&shape, n, &x, &mut expected);
-                blur::blur_forward(isa, &shape, n, &x, &mut actual, &mut row);
-                failures.compare(&format!("blur_forward {what}"), &actual, &expected, 1e-6);
-                let (mut expected, mut actual, mut row) = (nans(n * x_len), nans(n * x_len), nans(w));
-                reference::blur_backward(&shape, n, &dy, &mut expected);
-                blur::blur_backward(isa, &shape, n, &dy, &mut actual, &mut row);
-                failures.compare(&format!("blur_backward {what}"), &actual, &expected, 1e-6);
                 let (mut expected, mut actual) = (nans(n * x_len), nans(n * x_len));
                 reference::average_backward(&shape, n, &dy, &mut expected);
                 pool::average_backward(isa, &shape, n, &dy, &mut actual);
                 failures.compare(&format!("average_backward {what}"), &actual, &expected, 1e-6);
+            }
+        }
+    }
+    failures.report();
+}
+
+#[test]
+fn blurring_agrees_with_the_loops() {
+    let mut failures = Failures::default();
+    let sizes = [
+        ([2, 6, 7], [3, 3], [1, 1]),
+        ([3, 40, 160], [3, 3], [1, 1]),
+        ([2, 18, 78], [3, 3], [1, 1]),
+        ([1, 8, 16], [3, 3], [1, 1]),
+        ([1, 1, 1], [1, 1], [1, 1]),
+        ([1, 1, 1], [3, 3], [1, 1]),
+        ([2, 37, 33], [7, 5], [1, 1]),
+        ([1, 3, 95], [2, 4], [1, 1]),
+        ([2, 5, 37], [3, 3], [1, 2]),
+        ([2, 9, 35], [3, 2], [2, 1]),
+        ([1, 8, 8], [2, 2], [3, 5]),
+        ([1, 34, 9], [6, 7], [2, 3]),
+        ([2, 3, 3], [4, 2], [1, 1]),
+    ];
+    for ([c, h, w], [kh, kw], [stride_h, stride_w]) in sizes {
+        let windows = pool::PoolShape { c, h, w, kh, kw, stride_h, stride_w };
+        for pads in [[0, 0], [kh / 2, kw / 2], [kh - 1, 0], [0, kw - 1], [kh - 1, kw - 1]] {
+            let shape = blur::BlurShape { windows, pad_h: pads[0], pad_w: pads[1] };
+            let (x_len, y_len) = (c * h * w, c * shape.out_h() * shape.out_w());
+            for n in [0, 1, 3] {
+                let (x, dy) = (numbers(1, n * x_len), numbers(2, n * y_len));
+                for isa in isas() {
+                    let what = format!("{} n={n} {shape:?}", isa.name());
+                    let mut scratch = nans(shape.scratch_len());
+                    let (mut expected, mut actual) = (nans(n * y_len), nans(n * y_len));
+                    reference::blur_forward(&shape, n, &x, &mut expected);
+                    blur::blur_forward(isa, &shape, n, &x, &mut actual, &mut scratch);
+                    failures.compare(&format!("blur_forward {what}"), &actual, &expected, 1e-6);
+                    scratch.fill(f32::NAN);
+                    let (mut expected, mut actual) = (nans(n * x_len), nans(n * x_len));
+                    reference::blur_backward(&shape, n, &dy, &mut expected);
+                    blur::blur_backward(isa, &shape, n, &dy, &mut actual, &mut scratch);
+                    failures.compare(&format!("blur_backward {what}"), &actual, &expected, 1e-6);
+                }
             }
         }
     }

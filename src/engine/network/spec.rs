@@ -64,7 +64,7 @@ layer_specs! {
     "prelu" PRelu(PReluSpec) "{ kind = 'prelu', slopes = 'per_channel' }";
     "max_pool" MaxPool(MaxPoolSpec) "{ kind = 'max_pool', window = [2, 2] }";
     "average_pool" AveragePool(AveragePoolSpec) "{ kind = 'average_pool', window = [3, 2], stride = [1, 2] }";
-    "blur" Blur(BlurSpec) "{ kind = 'blur', window = [1, 3] }";
+    "blur" Blur(BlurSpec) "{ kind = 'blur', window = [2, 3], padding = [0, 1] }";
     "dropout" Dropout(DropoutSpec) "{ kind = 'dropout', drop_probability = 0.5 }";
     "flatten" Flatten(FlattenSpec) "{ kind = 'flatten' }";
     "dense" Dense(DenseSpec) "{ kind = 'dense', units = 3 }";

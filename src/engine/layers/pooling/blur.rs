@@ -1,56 +1,71 @@
 //! Blur before a stride.
 
 use serde::{Deserialize, Serialize};
-use steersman_kernels::blur::{self, MAX_TAPS, binomial};
+use steersman_kernels::blur::{self, BlurShape, MAX_TAPS, binomial};
 use steersman_kernels::pool::PoolShape;
 use steersman_kernels::{Backend, Isa};
 
-use super::window::{input_of, output_of, pool_shape};
+use super::window::{input_of, pool_shape};
 use crate::engine::layers::kind::{MAX_NUMBERS, check_sizes, pair};
-use crate::engine::layers::{ExportForm, Family, Grads, Layer, LayerKind, Pads, Pair, Pass, ReceptiveField};
+use crate::engine::layers::{ExportForm, Family, Grads, Layer, LayerKind, Linear, Pads, Pair, Pass, ReceptiveField};
 use crate::engine::tensor::Shape;
 
 /// Blurs each channel by fixed binomial weights (Zhang 2019, "Making Convolutional Networks Shift-Invariant Again"). A map that is
 /// blurred before a stride changes little when the picture moves by a pixel; one that is not takes fine texture for coarse.
 ///
-/// - **Forward** `y[c][i][j] = Σ_{k,l} a_k b_l x[c][i·s + k][j·s + l]`, where a and b are rows of Pascal's triangle over their sums.
-/// - **Backward** of `y[c][i][j] = Σ_{k,l} a_k b_l x[c][i·s + k][j·s + l]`: `dx[c][i·s + k][j·s + l] += a_k b_l dy[c][i][j]`.
-///   Needs nothing.
+/// - **Forward** `y[c][i][j] = Σ_{k,l} a_k b_l x[c][i·s + k − p][j·s + l − p]`, where a and b are rows of Pascal's triangle over their
+///   sums, and x is 0 outside the map.
+/// - **Backward** of `y[c][i][j] = Σ_{k,l} a_k b_l x[c][i·s + k − p][j·s + l − p]`: `dx[c][i·s + k − p][j·s + l − p] += a_k b_l
+///   dy[c][i][j]`. Needs nothing.
 /// - **Training and evaluation** are the same.
-/// - **Limits** No padding: rows and columns that do not fill a window are left out. Exports write it as a convolution, which has
-///   `c²` kernels.
+/// - **Limits** Rows and columns that do not fill a window are left out. The padding is less than the window. Exports write it as a
+///   convolution, which has `c²` kernels.
 ///
 /// # Shapes
 ///
-/// x, dx: `[n][c][h][w]`; y, dy: `[n][c][⌊(h − kh) / s⌋ + 1][⌊(w − kw) / s⌋ + 1]`.
+/// x, dx: `[n][c][h][w]`; y, dy: `[n][c][⌊(h + 2p − kh) / s⌋ + 1][⌊(w + 2p − kw) / s⌋ + 1]`.
 #[derive(Debug)]
 pub struct Blur {
-    shape: PoolShape,
+    shape: BlurShape,
     isa: Isa,
 }
 
 impl Blur {
-    /// Windows of `window` (height, width), `stride` apart.
+    /// Windows of `window` (height, width), `stride` apart, on maps with `padding` rows and columns of zeros on each side.
     ///
     /// # Errors
     ///
     /// A sentence that says what does not fit.
-    pub fn new(input: Shape, window: [usize; 2], stride: [usize; 2], isa: Isa) -> Result<Blur, String> {
-        Ok(Blur { shape: pool_shape(input, window, stride)?, isa })
+    pub fn new(
+        input: Shape,
+        window: [usize; 2],
+        stride: [usize; 2],
+        padding: [usize; 2],
+        isa: Isa,
+    ) -> Result<Blur, String> {
+        let [pad_h, pad_w] = padding;
+        // A window without any input would be a row of zeros.
+        if pad_h >= window[0].max(1) || pad_w >= window[1].max(1) {
+            let (padding, window) = (pair(padding), pair(window));
+            return Err(format!("a padding of {padding} is not less than the {window} window"));
+        }
+        let padded = Shape::new(input.c, input.h + 2 * pad_h, input.w + 2 * pad_w);
+        let windows = PoolShape { h: input.h, w: input.w, ..pool_shape(padded, window, stride)? };
+        Ok(Blur { shape: BlurShape { windows, pad_h, pad_w }, isa })
     }
 }
 
 impl Layer for Blur {
     fn input(&self) -> Shape {
-        input_of(&self.shape)
+        input_of(&self.shape.windows)
     }
 
     fn output(&self) -> Shape {
-        output_of(&self.shape)
+        Shape::new(self.shape.windows.c, self.shape.out_h(), self.shape.out_w())
     }
 
     fn scratch_len(&self, _n: usize) -> usize {
-        self.shape.w
+        self.shape.scratch_len()
     }
 
     fn infer(&self, _params: &[f32], _statistics: &[f32], n: usize, x: &[f32], y: &mut [f32], scratch: &mut [f32]) {
@@ -61,10 +76,20 @@ impl Layer for Blur {
         self.infer(params, &[], n, x, y, scratch);
     }
 
-    fn backward(&self, _params: &[f32], _pass: &Pass, n: usize, pair: Pair, dx: Option<&mut [f32]>, grads: Grads) {
+    fn backward(&self, params: &[f32], pass: &Pass, n: usize, pair: Pair, dx: Option<&mut [f32]>, grads: Grads) {
         if let Some(dx) = dx {
-            blur::blur_backward(self.isa, &self.shape, n, pair.dy, dx, grads.scratch);
+            self.backward_input(params, pass, n, pair.dy, dx, grads.scratch);
         }
+    }
+
+    fn linear(&self) -> Option<&dyn Linear> {
+        Some(self)
+    }
+}
+
+impl Linear for Blur {
+    fn backward_input(&self, _params: &[f32], _pass: &Pass, n: usize, dy: &[f32], dx: &mut [f32], scratch: &mut [f32]) {
+        blur::blur_backward(self.isa, &self.shape, n, dy, dx, scratch);
     }
 }
 
@@ -78,6 +103,9 @@ pub struct BlurSpec {
     /// Rows and columns from one window to the next.
     #[serde(default = "one")]
     pub stride: [usize; 2],
+    /// Rows of zeros above and below the map, columns of zeros on its left and right.
+    #[serde(default, skip_serializing_if = "is_none")]
+    pub padding: [usize; 2],
 }
 
 fn three() -> [usize; 2] {
@@ -86,6 +114,11 @@ fn three() -> [usize; 2] {
 
 fn one() -> [usize; 2] {
     [1, 1]
+}
+
+/// Files of recipes and models without padding stay as they were.
+fn is_none(padding: &[usize; 2]) -> bool {
+    *padding == [0, 0]
 }
 
 impl LayerKind for BlurSpec {
@@ -105,7 +138,7 @@ impl LayerKind for BlurSpec {
     }
 
     fn receptive_field(&self, _input: Shape) -> ReceptiveField {
-        ReceptiveField::Window { size: self.window, stride: self.stride, before: [0, 0] }
+        ReceptiveField::Window { size: self.window, stride: self.stride, before: self.padding.map(|pad| pad as isize) }
     }
 
     fn check(&self, input: Shape) -> Result<(), String> {
@@ -120,7 +153,7 @@ impl LayerKind for BlurSpec {
     }
 
     fn layer(&self, input: Shape, backend: Backend) -> Result<Box<dyn Layer>, String> {
-        Ok(Box::new(Blur::new(input, self.window, self.stride, backend.isa)?))
+        Ok(Box::new(Blur::new(input, self.window, self.stride, self.padding, backend.isa)?))
     }
 
     fn export_form(&self, input: Shape, _params: &[f32], _statistics: &[f32]) -> ExportForm {
@@ -133,7 +166,8 @@ impl LayerKind for BlurSpec {
                 *weight = down[k / kw] * along[k % kw];
             }
         }
-        let pads = Pads { top: 0, left: 0, bottom: 0, right: 0 };
+        let [rows, columns] = self.padding;
+        let pads = Pads { top: rows, left: columns, bottom: rows, right: columns };
         ExportForm::Conv { kernel: self.window, stride: self.stride, pads, weight, bias: vec![0.0; input.c] }
     }
 }
@@ -141,36 +175,81 @@ impl LayerKind for BlurSpec {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::engine::layers::check_kind;
     use crate::engine::layers::gradcheck::check_layer;
+    use crate::engine::layers::{ZeroPad, check_kind};
 
     #[test]
-    fn gradients_hold_for_any_window_and_stride() {
+    fn gradients_hold_for_any_window_stride_and_padding() {
         for isa in Isa::available() {
-            for (n, [c, h, w], window, stride) in [
-                (1, [1, 3, 3], [3, 3], [1, 1]),
-                (2, [2, 5, 7], [3, 3], [2, 2]),
-                (1, [3, 7, 8], [5, 2], [1, 3]),
-                (2, [1, 7, 20], [1, 7], [3, 1]),
+            for (n, [c, h, w], window, stride, padding) in [
+                (1, [1, 3, 3], [3, 3], [1, 1], [0, 0]),
+                (2, [2, 5, 19], [3, 3], [1, 1], [1, 1]),
+                (2, [2, 5, 7], [3, 3], [2, 2], [1, 1]),
+                (1, [3, 7, 8], [5, 2], [1, 3], [0, 1]),
+                (1, [1, 4, 3], [5, 4], [1, 1], [4, 2]),
+                (2, [1, 7, 20], [1, 7], [3, 1], [0, 6]),
             ] {
-                check_layer(&Blur::new(Shape::new(c, h, w), window, stride, isa).unwrap(), n);
+                check_layer(&Blur::new(Shape::new(c, h, w), window, stride, padding, isa).unwrap(), n);
             }
         }
     }
 
     #[test]
-    fn it_answers_truly_for_any_window_and_stride() {
-        for (window, stride) in [([3, 2], [2, 1]), ([5, 5], [1, 2]), ([1, 1], [1, 1])] {
-            check_kind(&BlurSpec { window, stride }, Shape::new(2, 7, 6));
+    fn it_answers_truly_for_any_window_stride_and_padding() {
+        for (window, stride, padding) in [
+            ([3, 2], [2, 1], [0, 0]),
+            ([5, 5], [1, 2], [2, 1]),
+            ([1, 1], [1, 1], [0, 0]),
+            ([3, 3], [1, 1], [1, 1]),
+            ([2, 3], [1, 1], [1, 2]),
+        ] {
+            check_kind(&BlurSpec { window, stride, padding }, Shape::new(2, 7, 6));
         }
+    }
+
+    #[test]
+    fn padding_is_what_a_layer_of_zeros_before_it_is() {
+        let input = Shape::new(2, 4, 21);
+        let x: Vec<f32> = (0..input.len()).map(|i| (i * 37 % 101) as f32 / 50.0 - 1.0).collect();
+        for isa in Isa::available() {
+            let zeros = ZeroPad::new(input, [1, 1], [2, 2]);
+            let infer = |layer: &dyn Layer, x: &[f32]| {
+                let mut y = vec![f32::NAN; layer.output().len()];
+                layer.infer(&[], &[], 1, x, &mut y, &mut vec![f32::NAN; layer.scratch_len(1)]);
+                y
+            };
+            let apart = Blur::new(zeros.output(), [3, 5], [1, 1], [0, 0], isa).unwrap();
+            let padded = Blur::new(input, [3, 5], [1, 1], [1, 2], isa).unwrap();
+            assert_eq!(padded.output(), apart.output());
+            assert_eq!(infer(&padded, &x), infer(&apart, &infer(&zeros, &x)), "{}", isa.name());
+        }
+    }
+
+    #[test]
+    fn padding_as_wide_as_the_window_is_refused() {
+        for (window, padding) in [([3, 3], [3, 0]), ([3, 2], [1, 2]), ([3, 3], [usize::MAX, 1])] {
+            let spec = BlurSpec { window, stride: [1, 1], padding };
+            let spec: &dyn LayerKind = &spec;
+            let error = spec.build(Shape::new(1, 9, 9), Isa::PORTABLE).unwrap_err();
+            assert!(error.contains("padding"), "{error}");
+        }
+    }
+
+    #[test]
+    fn a_blur_without_padding_is_read_and_written_as_it_always_was() {
+        let spec: BlurSpec = toml::from_str("window = [3, 3]").unwrap();
+        assert_eq!(spec, BlurSpec { window: [3, 3], stride: [1, 1], padding: [0, 0] });
+        assert!(!toml::to_string(&spec).unwrap().contains("padding"));
+        let padded = BlurSpec { padding: [0, 1], ..spec };
+        assert_eq!(toml::from_str::<BlurSpec>(&toml::to_string(&padded).unwrap()).unwrap(), padded);
     }
 
     #[test]
     fn the_weights_are_binomial_and_keep_the_mean() {
         let blur = |h, w, window, x: &[f32]| {
-            let layer = Blur::new(Shape::new(1, h, w), window, [1, 1], Isa::best()).unwrap();
+            let layer = Blur::new(Shape::new(1, h, w), window, [1, 1], [0, 0], Isa::best()).unwrap();
             let mut y = vec![f32::NAN; layer.output().len()];
-            layer.infer(&[], &[], 1, x, &mut y, &mut vec![f32::NAN; w]);
+            layer.infer(&[], &[], 1, x, &mut y, &mut vec![f32::NAN; layer.scratch_len(1)]);
             y
         };
         assert_eq!(blur(1, 5, [1, 3], &[0.0, 0.0, 16.0, 0.0, 0.0]), [4.0, 8.0, 4.0]);
