@@ -16,7 +16,7 @@ fn mixed(mut bits: u32) -> u32 {
 
 /// The random bits of element `index` in the stream that `key` names.
 #[inline(always)]
-fn random_bits(key: [u32; 2], index: u32) -> u32 {
+pub(crate) fn random_bits(key: [u32; 2], index: u32) -> u32 {
     mixed(mixed(index ^ key[0]).wrapping_add(key[1]))
 }
 

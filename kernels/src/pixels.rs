@@ -1,4 +1,8 @@
-//! Bytes of a picture to floats.
+//! Grey levels of a picture, as bytes: to floats, and changed at random.
+//!
+//! Integers alone decide what noise changes, so it is the same for every instruction set.
+
+use crate::dropout::random_bits;
 
 per_isa! {
     /// `dst = src * scale + offset` for each byte.
@@ -6,6 +10,89 @@ per_isa! {
         assert_eq!(src.len(), dst.len(), "u8_to_f32: src and dst differ in length");
         for (dst, &src) in dst.iter_mut().zip(src) {
             *dst = f32::from(src) * scale + offset;
+        }
+    }
+}
+
+per_isa! {
+    /// Adds to each grey level an error of its own, evenly spread over [-127, 127] `step` / 256 and rounded; 0 and 255 are the limits.
+    /// `key` names the stream of random bits, of which the `i`-th 32 serve `greys[4 i..4 i + 4]`, lowest byte first. Of the 256 values
+    /// of a byte, -128 counts as -127.
+    ///
+    /// # Panics
+    /// If `step` is above 256: an error would not fit 16 bits.
+    pub fn add_noise<S>(_simd: S, key: [u32; 2], step: u16, greys: &mut [u8]) {
+        assert!(step <= 256, "add_noise: a step of {step} is more than 256");
+        let error = |random: u8| (i16::from(random as i8).max(-127) * step as i16 + 128) >> 8;
+        let blocks = greys.len() / 64;
+        let (whole, rest) = greys.split_at_mut(blocks * 64);
+        for (block, greys) in whole.chunks_exact_mut(64).enumerate() {
+            let mut random = [0u8; 64];
+            for word in 0..16 {
+                let bits = random_bits(key, (block * 16 + word) as u32);
+                random[4 * word..][..4].copy_from_slice(&bits.to_le_bytes());
+            }
+            for (grey, &random) in greys.iter_mut().zip(&random) {
+                *grey = (i16::from(*grey) + error(random)).clamp(0, 255) as u8;
+            }
+        }
+        for (word, greys) in rest.chunks_mut(4).enumerate() {
+            let random = random_bits(key, (blocks * 16 + word) as u32).to_le_bytes();
+            for (grey, random) in greys.iter_mut().zip(random) {
+                *grey = (i16::from(*grey) + error(random)).clamp(0, 255) as u8;
+            }
+        }
+    }
+}
+
+per_isa! {
+    /// Adds `constant[x] + factor * slope[x]`, rounded, to the three grey levels of pixel `x`; 0 and 255 are the limits. Errors are within
+    /// ±256.
+    pub fn add_grey<S>(_simd: S, constant: &[f32], slope: &[f32], factor: f32, rgb: &mut [u8]) {
+        /// Pixels at a time.
+        const PIXELS: usize = 64;
+        assert!(constant.len() == slope.len() && rgb.len() == 3 * slope.len(), "add_grey: lengths that do not fit");
+        let (mut errors, mut spread) = ([0i16; PIXELS], [0i16; 3 * PIXELS]);
+        let pieces = constant.chunks(PIXELS).zip(slope.chunks(PIXELS)).zip(rgb.chunks_mut(3 * PIXELS));
+        for ((constant, slope), rgb) in pieces {
+            for ((error, &constant), &slope) in errors.iter_mut().zip(constant).zip(slope) {
+                // Half a grey level more, as the conversion of what is not negative cuts off.
+                *error = (constant + factor * slope + 256.5) as i16 - 256;
+            }
+            for (spread, &error) in spread.chunks_exact_mut(3).zip(&errors) {
+                spread.fill(error);
+            }
+            for (grey, &error) in rgb.iter_mut().zip(&spread) {
+                *grey = (i16::from(*grey) + error).clamp(0, 255) as u8;
+            }
+        }
+    }
+}
+
+per_isa! {
+    /// Multiplies the colour of each pixel, three bytes, by `matrix` and adds `offset` to each channel; what is behind the decimal point is
+    /// cut off, and 0 and 255 are the limits.
+    pub fn recolour<S>(_simd: S, matrix: &[[f32; 3]; 3], offset: f32, rgb: &mut [u8]) {
+        /// Pixels whose channels are taken apart at a time, so that vectors hold one channel each.
+        const PIXELS: usize = 64;
+        let (mut from, mut to) = ([[0u8; PIXELS]; 3], [[0u8; PIXELS]; 3]);
+        for rgb in rgb.chunks_mut(3 * PIXELS) {
+            for (x, px) in rgb.chunks_exact(3).enumerate() {
+                for (channel, &grey) in from.iter_mut().zip(px) {
+                    channel[x] = grey;
+                }
+            }
+            for (to, [wr, wg, wb]) in to.iter_mut().zip(matrix) {
+                for x in 0..PIXELS {
+                    let [r, g, b] = [f32::from(from[0][x]), f32::from(from[1][x]), f32::from(from[2][x])];
+                    to[x] = (wr * r + wg * g + wb * b + offset) as u8;
+                }
+            }
+            for (x, px) in rgb.chunks_exact_mut(3).enumerate() {
+                for (grey, channel) in px.iter_mut().zip(&to) {
+                    *grey = channel[x];
+                }
+            }
         }
     }
 }

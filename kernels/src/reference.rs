@@ -346,6 +346,24 @@ pub fn sgd_momentum(lr: f32, momentum: f32, l2: f32, params: &mut [f32], grads: 
     }
 }
 
+/// See [`crate::pixels::add_grey`].
+pub fn add_grey(constant: &[f32], slope: &[f32], factor: f32, rgb: &mut [u8]) {
+    for (x, px) in rgb.chunks_exact_mut(3).enumerate() {
+        let error = (constant[x] + factor * slope[x] + 0.5).floor() as i32;
+        px.iter_mut().for_each(|grey| *grey = (i32::from(*grey) + error).clamp(0, 255) as u8);
+    }
+}
+
+/// See [`crate::pixels::recolour`].
+pub fn recolour(matrix: &[[f32; 3]; 3], offset: f32, rgb: &mut [u8]) {
+    for px in rgb.chunks_exact_mut(3) {
+        let before = [f32::from(px[0]), f32::from(px[1]), f32::from(px[2])];
+        for k in 0..3 {
+            px[k] = (matrix[k][0] * before[0] + matrix[k][1] * before[1] + matrix[k][2] * before[2] + offset) as u8;
+        }
+    }
+}
+
 /// See [`crate::pixels::u8_to_f32`].
 pub fn u8_to_f32(src: &[u8], scale: f32, offset: f32, dst: &mut [f32]) {
     for i in 0..src.len() {

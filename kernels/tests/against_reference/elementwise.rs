@@ -305,6 +305,31 @@ fn updates_agree_with_the_loops() {
 }
 
 #[test]
+fn noise_is_the_same_on_every_instruction_set_even_and_held_between_black_and_white() {
+    let noise = |isa, key, step, grey, len| {
+        let mut greys = vec![grey; len];
+        pixels::add_noise(isa, key, step, &mut greys);
+        greys
+    };
+    for isa in isas() {
+        for len in [0, 1, 3, 4, 63, 64, 65, 130, 1000] {
+            let expected = noise(steersman_kernels::Isa::PORTABLE, [3, 5], 129, 128, 1000);
+            assert_eq!(noise(isa, [3, 5], 129, 128, len), expected[..len], "{} {len}", isa.name());
+        }
+        // With a step of 256 an error is a random number of [-127, 127]: -127 twice as often as each other.
+        let mut counts = [0usize; 256];
+        let greys = noise(isa, [1, 2], 256, 128, 256 * 400);
+        greys.iter().for_each(|grey| counts[usize::from(*grey)] += 1);
+        assert!(counts[0] == 0 && (700..900).contains(&counts[1]), "{:?}", &counts[..2]);
+        assert!(counts[2..].iter().all(|count| (300..500).contains(count)), "{counts:?}");
+        assert!(noise(isa, [1, 2], 128, 250, 5000).iter().any(|grey| *grey == 255));
+        assert!(noise(isa, [1, 2], 128, 5, 5000).iter().any(|grey| *grey == 0));
+        assert!(noise(isa, [1, 2], 0, 77, 500).iter().all(|grey| *grey == 77));
+        assert_ne!(noise(isa, [1, 2], 128, 128, 64), noise(isa, [2, 2], 128, 128, 64));
+    }
+}
+
+#[test]
 fn pixels_agree_with_the_loops() {
     let mut failures = Failures::default();
     for isa in isas() {
@@ -314,6 +339,21 @@ fn pixels_agree_with_the_loops() {
             reference::u8_to_f32(&src, 1.0 / 127.5, -1.0, &mut expected);
             pixels::u8_to_f32(isa, &src, 1.0 / 127.5, -1.0, &mut actual);
             failures.compare(&format!("u8_to_f32 {} {len}", isa.name()), &actual, &expected, 1e-6);
+
+            // Sums of quarters and halves are exact, so rounding is decided alike everywhere.
+            let constant: Vec<f32> = (0..len).map(|i| (i * 37 % 800) as f32 * 0.25 - 100.0).collect();
+            let slope: Vec<f32> = (0..len).map(|i| (i * 11 % 200) as f32 - 100.0).collect();
+            let rgb = [src.as_slice(); 3].concat();
+            let (mut expected, mut actual) = (rgb.clone(), rgb.clone());
+            reference::add_grey(&constant, &slope, 0.5, &mut expected);
+            pixels::add_grey(isa, &constant, &slope, 0.5, &mut actual);
+            assert_eq!(actual, expected, "add_grey {} {len}", isa.name());
+
+            let matrix = [[0.5, -0.25, 0.75], [1.5, 0.0, -1.0], [0.1, 0.2, 0.9]];
+            let (mut expected, mut actual) = (rgb.clone(), rgb);
+            reference::recolour(&matrix, 20.5, &mut expected);
+            pixels::recolour(isa, &matrix, 20.5, &mut actual);
+            assert_eq!(actual, expected, "recolour {} {len}", isa.name());
         }
     }
     failures.report();

@@ -1,5 +1,7 @@
 //! The changes themselves, on pictures `[h][w][3]`.
 
+use steersman_kernels::{Isa, pixels};
+
 /// Grey levels times `factor`, rounded and clamped.
 pub(super) fn factors(factor: f64) -> [u8; 256] {
     std::array::from_fn(|grey| (grey as f64 * factor).round().min(255.0) as u8)
@@ -95,10 +97,5 @@ pub(super) fn recolour(rgb: &mut [u8], turn: f64, saturation: f64, tint: [f64; 3
     let rows: [[f32; 3]; 3] = std::array::from_fn(|k| rows[k].map(|v| (v * tint[k] * contrast) as f32));
     // Half a grey level more, as the conversion to bytes cuts off.
     let offset = (grey * (1.0 - contrast) + 0.5) as f32;
-    for px in rgb.chunks_exact_mut(3) {
-        let [r, g, b] = [f32::from(px[0]), f32::from(px[1]), f32::from(px[2])];
-        for (out, [wr, wg, wb]) in px.iter_mut().zip(&rows) {
-            *out = (wr * r + wg * g + wb * b + offset) as u8;
-        }
-    }
+    pixels::recolour(Isa::best(), &rows, offset, rgb);
 }

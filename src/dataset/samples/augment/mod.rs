@@ -16,7 +16,7 @@ use rand::Rng;
 use serde::{Deserialize, Serialize};
 
 use changes::{Band, factors, line, recolour, shadow, shift};
-use noise::{block_noise, pixel_noise};
+use noise::{MAX_BLOCK, block_noise, pixel_noise};
 
 /// The entry `view` of `[augmentation]`: the picture is warped to what a car beside the driven path would see, and the label is the
 /// steering that leads it back (Bojarski et al. 2016, PilotNet).
@@ -252,7 +252,7 @@ impl Augmentation {
             let amplitude = uniform(rng, 0.0, self.block_noise);
             let source_rows_per_row =
                 (preprocessing.rows[1] - preprocessing.rows[0]) as f64 / preprocessing.rgb_size()[0] as f64;
-            let side = |source_px: f64| (8.0 / source_px).round().max(1.0) as usize;
+            let side = |source_px: f64| ((8.0 / source_px).round() as usize).clamp(1, MAX_BLOCK);
             let block = [side(source_rows_per_row), side(preprocessing.source_px_per_rgb_px())];
             block_noise(rgb, width, block, amplitude, rng);
         }

@@ -1,26 +1,39 @@
 //! Noise that is added to pictures: that of single pixels, and that of a JPEG's blocks.
 
 use rand::Rng;
+use steersman_kernels::{Isa, pixels};
 
 use crate::engine::random::uniform;
 
+/// Largest height and width of a block, pixels.
+pub(super) const MAX_BLOCK: usize = 64;
+
 /// Adds an error to each block of `block` (height, width) pixels: constant, and a half wave along each axis, each of up to `amplitude`
 /// grey levels.
+///
+/// # Panics
+/// If a block is higher or wider than [`MAX_BLOCK`].
 pub(super) fn block_noise(rgb: &mut [u8], width: usize, block: [usize; 2], amplitude: f64, rng: &mut impl Rng) {
-    let rows = rgb.len() / (width * 3);
-    let wave = |at: usize, side: usize| (std::f64::consts::PI * (at as f64 + 0.5) / side as f64).cos();
-    for top in (0..rows).step_by(block[0]) {
-        for left in (0..width).step_by(block[1]) {
-            let [constant, down, along] = [(); 3].map(|()| uniform(rng, -amplitude, amplitude));
-            for y in top..rows.min(top + block[0]) {
-                let of_row = constant + down * wave(y - top, block[0]);
-                for x in left..width.min(left + block[1]) {
-                    // Half a grey level more, as the conversion to bytes cuts off.
-                    let error = (of_row + along * wave(x - left, block[1]) + 0.5) as f32;
-                    for grey in &mut rgb[(y * width + x) * 3..][..3] {
-                        *grey = (f32::from(*grey) + error) as u8;
-                    }
+    let half_wave = |side: usize| -> [f64; MAX_BLOCK] {
+        std::array::from_fn(|at| (std::f64::consts::PI * (at as f64 + 0.5) / side as f64).cos())
+    };
+    let [down_wave, along_wave] = block.map(half_wave);
+    // Strips of as many blocks as fit into buffers of fixed size.
+    let strip = MAX_BLOCK / block[1] * block[1];
+    let (mut constants, mut slopes) = ([0.0; MAX_BLOCK], [0.0; MAX_BLOCK]);
+    for rows in rgb.chunks_mut(block[0] * width * 3) {
+        for left in (0..width).step_by(strip) {
+            let columns = strip.min(width - left);
+            let (constants, slopes) = (&mut constants[..columns], &mut slopes[..columns]);
+            for (constants, slopes) in constants.chunks_mut(block[1]).zip(slopes.chunks_mut(block[1])) {
+                let [constant, down, along] = [(); 3].map(|()| uniform(rng, -amplitude, amplitude));
+                slopes.fill(down as f32);
+                for (sum, wave) in constants.iter_mut().zip(&along_wave) {
+                    *sum = (constant + along * wave) as f32;
                 }
+            }
+            for (row, &wave) in rows.chunks_exact_mut(width * 3).zip(&down_wave) {
+                pixels::add_grey(Isa::best(), constants, slopes, wave as f32, &mut row[3 * left..][..3 * columns]);
             }
         }
     }
@@ -28,14 +41,9 @@ pub(super) fn block_noise(rgb: &mut [u8], width: usize, block: [usize; 2], ampli
 
 /// Adds an error of up to `amplitude` grey levels to each grey level.
 pub(super) fn pixel_noise(rgb: &mut [u8], amplitude: f64, rng: &mut impl Rng) {
-    // A random byte for each grey level, [-127, 127] / 127 of the amplitude, which counts in 1/256 of a grey level.
-    let step = (amplitude * 256.0 / 127.0).round() as i32;
-    for greys in rgb.chunks_mut(8) {
-        for (grey, random) in greys.iter_mut().zip(rng.next_u64().to_le_bytes()) {
-            let error = (i32::from(random as i8).max(-127) * step + 128) >> 8;
-            *grey = (i32::from(*grey) + error).clamp(0, 255) as u8;
-        }
-    }
+    let bits = rng.next_u64();
+    let step = (amplitude * 256.0 / 127.0).round() as u16;
+    pixels::add_noise(Isa::best(), [bits as u32, (bits >> 32) as u32], step, rgb);
 }
 
 #[cfg(test)]
