@@ -53,14 +53,23 @@ def pilotnet():
     )  # fmt: skip
 
 
+def binomial_blur(channels):
+    """A fixed blur of 3x3 in each channel."""
+    row = torch.tensor([1.0, 2.0, 1.0]) / 4
+    blur = nn.Conv2d(channels, channels, 3, padding=1, groups=channels, bias=False)
+    blur.weight = nn.Parameter(torch.outer(row, row).expand(channels, 1, 3, 3).clone(), requires_grad=False)
+    return blur
+
+
 def default():
     def conv(before, after, kernel):
-        return [nn.Conv2d(before, after, kernel, 2), nn.BatchNorm2d(after, eps=1e-3, momentum=0.02), nn.ReLU()]
+        norm = nn.BatchNorm2d(after, eps=1e-3, momentum=0.02)
+        return [binomial_blur(before), nn.Conv2d(before, after, kernel, 2), norm, nn.ReLU()]
 
     return nn.Sequential(
         *conv(3, 16, 5), *conv(16, 24, 3), *conv(24, 32, 3),
-        nn.Conv2d(32, 48, 3), nn.ReLU(), nn.Flatten(), nn.Dropout(0.1),
-        nn.Linear(48 * 16, 64), nn.ReLU(), nn.Linear(64, 1),
+        nn.Conv2d(32, 48, 3), nn.ELU(), nn.Flatten(), nn.Dropout(0.1),
+        nn.Linear(48 * 16, 64), nn.ELU(), nn.Linear(64, 1),
     )  # fmt: skip
 
 
@@ -85,7 +94,7 @@ def tensors(args, batch):
 
 
 def train(model, args):
-    optimizer, loss = torch.optim.Adam(model.parameters(), 1e-3, fused=True), nn.MSELoss()
+    optimizer, loss = torch.optim.Adam((p for p in model.parameters() if p.requires_grad), 1e-3, fused=True), nn.MSELoss()
     x, y = tensors(args, args.batch)
 
     def step(i):

@@ -13,7 +13,7 @@ use crate::dataset::augment::Augmentation;
 use crate::dataset::colour::Colour;
 use crate::dataset::split::SplitMode;
 use crate::dataset::{Description, LabelKind, LabelSpec};
-use crate::engine::layers::BlurSpec;
+use crate::engine::layers::{BlurSpec, EluSpec, ReluSpec};
 use crate::engine::loss::Smoothness;
 use crate::engine::network::LayerSpec;
 use crate::engine::optimizer::AveragingSpec;
@@ -36,7 +36,7 @@ pub enum Subject {
     /// What labels are: the recorded wheel, or the steering that follows the driven path, with look-aheads of 0.7, 1.0 and 1.3 s.
     Labels,
     /// What makes the wheel calm: the recipe with none of them, averaged weights, noise in the pictures, each term of smoothness, blur before
-    /// each stride, all of them.
+    /// each stride, ELU in place of ReLU, the last two and noise, all of them.
     Smooth,
 }
 
@@ -90,19 +90,30 @@ impl Subject {
                     block_noise,
                     ..base.augmentation.clone()
                 };
-                let plain =
-                    || Recipe { averaging: None, smoothness: None, augmentation: with_noise([0.0; 2]), ..base.clone() };
+                let none = angular(&unblurred(&base.layers));
+                let plain = || Recipe {
+                    averaging: None,
+                    smoothness: None,
+                    augmentation: with_noise([0.0; 2]),
+                    layers: none.clone(),
+                    ..base.clone()
+                };
                 let augmentation = with_noise(NOISE);
                 let averaging = Some(AveragingSpec::Ema { decay: DECAY, from_share: 0.0, refit_batches: 0 });
                 let terms = |spatial, temporal| Some(Smoothness { spatial, temporal, ..Smoothness::default() });
-                let layers = blurred(&base.layers);
+                let layers = blurred(&rounded(&none));
                 vec![
                     ("plain", plain()),
                     ("averaged", Recipe { averaging, ..plain() }),
                     ("noise", Recipe { augmentation: augmentation.clone(), ..plain() }),
                     ("spatial", Recipe { smoothness: terms(TERM, 0.0), ..plain() }),
                     ("temporal", Recipe { smoothness: terms(0.0, TERM), ..plain() }),
-                    ("blur", Recipe { layers: layers.clone(), ..plain() }),
+                    ("blur", Recipe { layers: blurred(&none), ..plain() }),
+                    ("elu", Recipe { layers: rounded(&none), ..plain() }),
+                    (
+                        "blur+noise+elu",
+                        Recipe { layers: layers.clone(), augmentation: augmentation.clone(), ..plain() },
+                    ),
                     ("together", Recipe { averaging, augmentation, smoothness: terms(TERM, TERM), layers, ..plain() }),
                 ]
             }
@@ -120,6 +131,31 @@ fn blurred(layers: &[LayerSpec]) -> Vec<LayerSpec> {
         blurred.push(layer.clone());
     }
     blurred
+}
+
+/// `layers` without their blurs.
+fn unblurred(layers: &[LayerSpec]) -> Vec<LayerSpec> {
+    layers.iter().filter(|layer| !matches!(layer, LayerSpec::Blur(_))).cloned().collect()
+}
+
+/// `layers` with ELU in place of ReLU, but for those behind a batch normalisation, with which ReLU is computed in one pass.
+fn rounded(layers: &[LayerSpec]) -> Vec<LayerSpec> {
+    let mut rounded = layers.to_vec();
+    for (layer, before) in rounded.iter_mut().skip(1).zip(layers) {
+        if matches!((&*layer, before), (LayerSpec::Relu(_), before) if !matches!(before, LayerSpec::BatchNorm(_))) {
+            *layer = LayerSpec::Elu(EluSpec { alpha: 1.0 });
+        }
+    }
+    rounded
+}
+
+/// `layers` with ReLU in place of ELU.
+fn angular(layers: &[LayerSpec]) -> Vec<LayerSpec> {
+    let relu = |layer: &LayerSpec| match layer {
+        LayerSpec::Elu(_) => LayerSpec::Relu(ReluSpec {}),
+        other => other.clone(),
+    };
+    layers.iter().map(relu).collect()
 }
 
 /// An experiment.
@@ -369,14 +405,28 @@ mod tests {
             let read = Recipe::parse(name, &recipe.to_toml().unwrap(), &[]).unwrap_or_else(|e| panic!("{name}: {e}"));
             assert_eq!(read, *recipe);
         }
-        let differences = |recipe: &Recipe| {
+        let count = |recipe: &Recipe, kind| recipe.layers.iter().filter(|layer| layer.base_name() == kind).count();
+        let ingredients = |recipe: &Recipe| {
             let noise = recipe.augmentation != plain.augmentation;
-            [recipe.averaging.is_some(), noise, recipe.smoothness.is_some(), recipe.layers != base.layers].map(u8::from)
+            let switches = [recipe.averaging.is_some(), noise, recipe.smoothness.is_some()].map(usize::from);
+            (switches, [count(recipe, "blur"), count(recipe, "elu"), count(recipe, "relu")])
         };
-        let found: Vec<_> = variants.iter().map(|(_, recipe)| differences(recipe)).collect();
-        assert_eq!(found, [[0; 4], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 1, 0], [0, 0, 0, 1], [1; 4]]);
-        let blurs = variants[5].1.layers.iter().filter(|layer| layer.base_name() == "blur").count();
-        assert_eq!((blurs, variants[5].1.layers[0].base_name()), (3, "blur"));
+        let found: Vec<_> = variants.iter().map(|(name, recipe)| (*name, ingredients(recipe))).collect();
+        let none = [0, 0, 5];
+        let expected = [
+            ("plain", ([0, 0, 0], none)),
+            ("averaged", ([1, 0, 0], none)),
+            ("noise", ([0, 1, 0], none)),
+            ("spatial", ([0, 0, 1], none)),
+            ("temporal", ([0, 0, 1], none)),
+            ("blur", ([0, 0, 0], [3, 0, 5])),
+            ("elu", ([0, 0, 0], [0, 2, 3])),
+            ("blur+noise+elu", ([0, 1, 0], [3, 2, 3])),
+            ("together", ([1, 1, 1], [3, 2, 3])),
+        ];
+        assert_eq!(found, expected);
+        // The three that cost no laps make `default`.
+        assert_eq!((&variants[7].1.layers, &variants[7].1.augmentation), (&base.layers, &base.augmentation));
     }
 
     #[test]

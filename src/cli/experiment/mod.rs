@@ -85,7 +85,7 @@ enum SubjectArg {
     Labels,
     /// Models of all qualities: does driving on a recording tell how they drive in the simulator?
     Replay,
-    /// Averaged weights, noise in the pictures, terms of smoothness, blur before strides: what makes the wheel calm
+    /// Averaged weights, noise in the pictures, terms of smoothness, blur before strides, ELU: what makes the wheel calm
     Smooth,
 }
 
@@ -247,8 +247,8 @@ fn print_table(plan: &ExperimentPlan, trials: &[ExperimentRow]) {
         plan.tracks.join(", "),
         counted(plan.runs, "run")
     );
-    println!("                     promised by validation |  delivered on the road");
-    println!("variant        leak       MSE       MAE     |  fresh MAE   laps     autonomy       distance from line");
+    println!("                       promised by validation |  delivered on the road");
+    println!("variant          leak       MSE       MAE     |  fresh MAE   laps     autonomy       distance from line");
     let mut variants: Vec<&str> = trials.iter().map(|trial| trial.variant.as_str()).collect();
     variants.dedup();
     for variant in variants {
@@ -262,7 +262,7 @@ fn print_table(plan: &ExperimentPlan, trials: &[ExperimentRow]) {
         let laps: usize = of.iter().map(|trial| trial.laps_completed).sum();
         let laps_total: usize = of.iter().map(|trial| trial.laps_total).sum();
         println!(
-            "{variant:<13} {:>3.0} %  {:>8}  {:>6} deg  |  {:>5.2} deg {:>9}  {:>5.1} % ({low:.0} to {high:.0}) {:>8.2} m",
+            "{variant:<15} {:>3.0} %  {:>8}  {:>6} deg  |  {:>5.2} deg {:>9}  {:>5.1} % ({low:.0} to {high:.0}) {:>8.2} m",
             mean(&|t| t.leak_percent),
             or_dash(present(&|t| t.val_center_mse), 5),
             or_dash(present(&|t| t.val_mae_deg), 2),
@@ -273,14 +273,14 @@ fn print_table(plan: &ExperimentPlan, trials: &[ExperimentRow]) {
         );
     }
     if plan.subject == Subject::Smooth {
-        println!("variant         whiteness (worst)        reversals        change a frame, 95 %     lateral jerk");
+        println!("variant           whiteness (worst)        reversals        change a frame, 95 %     lateral jerk");
         let mut variants: Vec<&str> = trials.iter().map(|trial| trial.variant.as_str()).collect();
         variants.dedup();
         for variant in variants {
             let of: Vec<&ExperimentRow> = trials.iter().filter(|trial| trial.variant == variant).collect();
             let mean = |f: &dyn Fn(&ExperimentRow) -> f64| of.iter().map(|t| f(t)).sum::<f64>() / of.len() as f64;
             println!(
-                "{variant:<13} {:>5.1} deg/s ({:.1}) {:>12.1} a minute {:>16.2} deg {:>14.1} m/s³",
+                "{variant:<15} {:>5.1} deg/s ({:.1}) {:>12.1} a minute {:>16.2} deg {:>14.1} m/s³",
                 mean(&|t| t.whiteness_deg_s),
                 of.iter().map(|t| t.worst_whiteness_deg_s).fold(0.0, f64::max),
                 mean(&|t| t.reversals_per_min),
