@@ -20,7 +20,9 @@ impl ChainStep {
     /// Number of weights or slopes.
     pub fn weight_len(&self) -> usize {
         match &self.form {
-            ExportForm::Conv { weight, .. } | ExportForm::Dense { weight, .. } => weight.len(),
+            ExportForm::Conv { weight, .. }
+            | ExportForm::Depthwise { weight, .. }
+            | ExportForm::Dense { weight, .. } => weight.len(),
             ExportForm::PRelu { slopes } => slopes.len(),
             ExportForm::Identity
             | ExportForm::Elementwise(_)
@@ -73,9 +75,9 @@ pub(crate) fn check_finite(steps: &[ChainStep]) -> Result<()> {
     let all_finite = |values: &[f32]| values.iter().all(|value| value.is_finite());
     for ChainStep { name, form, .. } in steps {
         let is_finite = match form {
-            ExportForm::Conv { weight, bias, .. } | ExportForm::Dense { weight, bias } => {
-                all_finite(weight) && all_finite(bias)
-            }
+            ExportForm::Conv { weight, bias, .. }
+            | ExportForm::Depthwise { weight, bias, .. }
+            | ExportForm::Dense { weight, bias } => all_finite(weight) && all_finite(bias),
             ExportForm::BatchNorm { gamma, beta, mean, variance, epsilon } => {
                 let ChannelAffine { scale, shift } = scale_and_shift(gamma, beta, mean, variance, *epsilon);
                 scale.iter().chain(&shift).all(|value| (*value as f32).is_finite())
@@ -132,7 +134,11 @@ pub(crate) fn fold_batch_norm(chain: Vec<ChainStep>) -> Vec<ChainStep> {
         let before = folded.last_mut().map(|step| &mut step.form);
         match (before, &step.form) {
             (
-                Some(ExportForm::Conv { weight, bias, .. } | ExportForm::Dense { weight, bias }),
+                Some(
+                    ExportForm::Conv { weight, bias, .. }
+                    | ExportForm::Depthwise { weight, bias, .. }
+                    | ExportForm::Dense { weight, bias },
+                ),
                 ExportForm::BatchNorm { gamma, beta, mean, variance, epsilon },
             ) => {
                 let ChannelAffine { scale, shift } = scale_and_shift(gamma, beta, mean, variance, *epsilon);
@@ -153,6 +159,7 @@ pub(crate) fn fold_batch_norm(chain: Vec<ChainStep>) -> Vec<ChainStep> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::engine::layers::Pads;
     use crate::engine::network::LayerSpec;
     use steersman_kernels::Isa;
 
@@ -220,5 +227,30 @@ mod tests {
         // (4 x + 1 − 2) · 3 / 2 + 0.5
         let expected = ExportForm::Dense { weight: vec![6.0], bias: vec![-1.0] };
         assert_eq!(fold_batch_norm(vec![step(dense), step(batch_norm)]), [step(expected)]);
+    }
+
+    #[test]
+    fn each_channel_of_a_depthwise_convolution_takes_its_own_scale_and_shift() {
+        let batch_norm = ExportForm::BatchNorm {
+            gamma: vec![3.0, 4.0],
+            beta: vec![0.5, -1.0],
+            mean: vec![2.0, 1.0],
+            variance: vec![3.75, 0.75],
+            epsilon: 0.25,
+        };
+        let shape = Shape::new(2, 1, 2);
+        let step = |form| ChainStep { name: String::new(), input: shape, output: shape, form };
+        let pads = Pads { top: 0, left: 0, bottom: 0, right: 1 };
+        let depthwise = |weight: [f32; 4], bias: [f32; 2]| ExportForm::Depthwise {
+            kernel: [1, 2],
+            stride: [1, 1],
+            pads,
+            weight: weight.into(),
+            bias: bias.into(),
+        };
+        let before = depthwise([1.0, 2.0, 3.0, 4.0], [1.0, 0.0]);
+        // (x − 2) · 3 / 2 + 0.5 and (x − 1) · 4 − 1
+        let expected = depthwise([1.5, 3.0, 12.0, 16.0], [-1.0, -5.0]);
+        assert_eq!(fold_batch_norm(vec![step(before), step(batch_norm)]), [step(expected)]);
     }
 }

@@ -100,6 +100,7 @@ fn network(graph: &mut GraphBuilder, steps: &[ChainStep], input: &str, outputs: 
     for step in steps {
         let takes = match step.form {
             ExportForm::Conv { .. }
+            | ExportForm::Depthwise { .. }
             | ExportForm::MaxPool { .. }
             | ExportForm::AveragePool { .. }
             | ExportForm::Crop { .. }
@@ -145,11 +146,14 @@ fn operation(graph: &mut GraphBuilder, step: &ChainStep, x: &str, is_map: bool) 
     let ChainStep { name, input, output, form } = step;
     let constant = |what: &str| format!("{name}.{what}");
     match form {
-        ExportForm::Conv { kernel, stride, pads, weight, bias } => {
-            let weight = graph.floats(&constant("weight"), &[output.c, input.c, kernel[0], kernel[1]], weight);
+        ExportForm::Conv { kernel, stride, pads, weight, bias }
+        | ExportForm::Depthwise { kernel, stride, pads, weight, bias } => {
+            let group = if matches!(form, ExportForm::Conv { .. }) { 1 } else { input.c };
+            let weight = graph.floats(&constant("weight"), &[output.c, input.c / group, kernel[0], kernel[1]], weight);
             let bias = graph.floats(&constant("bias"), &[output.c], bias);
             let pads = ints("pads", &[pads.top, pads.left, pads.bottom, pads.right]);
-            let attributes = vec![ints("kernel_shape", kernel), ints("strides", stride), pads];
+            let attributes =
+                vec![ints("kernel_shape", kernel), ints("strides", stride), pads, int("group", group as i64)];
             graph.node("Conv", name, &[x, &weight, &bias], attributes)
         }
         ExportForm::Dense { weight, bias } => {
@@ -329,6 +333,18 @@ mod tests {
             graph.node.iter().filter(|node| node.op_type == "BatchNormalization").count()
         };
         assert_eq!((count(false), count(true)), (6, 0));
+    }
+
+    #[test]
+    fn a_blur_is_a_convolution_with_a_group_for_each_channel() {
+        let (_, graph) = decode("default", OnnxOptions::default());
+        let blurs: Vec<_> = graph.node.iter().filter(|node| node.name.starts_with("blur")).collect();
+        assert!(!blurs.is_empty());
+        for blur in blurs {
+            let weight = graph.initializer.iter().find(|constant| constant.name == blur.input[1]).unwrap();
+            let group = blur.attribute.iter().find(|attribute| attribute.name == "group").unwrap();
+            assert_eq!((blur.op_type.as_str(), &weight.dims[..]), ("Conv", &[group.i.unwrap(), 1, 3, 3][..]));
+        }
     }
 
     #[test]

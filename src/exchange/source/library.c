@@ -273,6 +273,16 @@ static void conv2d(const float *x, float *y, const float *weight, const float *b
     }
 }
 
+/* == depthwise */
+/* The convolution of each channel alone, weights [c][kernel_h][kernel_w]. */
+static void depthwise(const float *x, float *y, const float *weight, const float *bias, struct conv s) {
+    struct conv one = s;
+    one.c = one.filters = 1;
+    for (int c = 0; c < s.c; c++) {
+        conv2d(x + c * s.h * s.w, y + c * s.out_h * s.out_w, weight + c * s.kernel_h * s.kernel_w, bias + c, one);
+    }
+}
+
 /* == dense */
 /* [inputs] to [units], weights [units][inputs]. */
 static void dense(const float *x, float *y, const float *weight, const float *bias, int inputs, int units) {

@@ -108,6 +108,7 @@ fn needs(function: &str) -> &'static [&'static str] {
         "hsv" => &["descale", "clamp_level", "extremes", "saturation"],
         "hls" => &["extremes", "round_half_even"],
         "lab" => &["descale", "clamp_level"],
+        "depthwise" => &["conv2d"],
         "max_pool" | "average_pool" => &["pool"],
         "elu" | "hyperbolic_tangent" | "sigmoid" => &["exp"],
         _ => &[],
@@ -334,7 +335,9 @@ impl<'a> Program<'a> {
         let array = |what: &str| format!("{name}_{what}");
         let change = |program: &Program| Arg::Change(program.result, input.len());
         match form {
-            ExportForm::Conv { kernel, stride, pads, weight, bias } => {
+            ExportForm::Conv { kernel, stride, pads, weight, bias }
+            | ExportForm::Depthwise { kernel, stride, pads, weight, bias } => {
+                let function = if matches!(form, ExportForm::Conv { .. }) { "conv2d" } else { "depthwise" };
                 let weight = self.array(array("weight"), Values::F32(weight.clone()));
                 let bias = self.array(array("bias"), Values::F32(bias.clone()));
                 let mut sizes = map_sizes(*input);
@@ -343,7 +346,7 @@ impl<'a> Program<'a> {
                 sizes.extend([("stride_h", stride[0]), ("stride_w", stride[1])]);
                 sizes.extend([("pad_top", pads.top), ("pad_left", pads.left)]);
                 sizes.extend([("out_h", output.h), ("out_w", output.w)]);
-                self.map_call(step, "conv2d", vec![weight, bias, Arg::Sizes("conv", sizes)]);
+                self.map_call(step, function, vec![weight, bias, Arg::Sizes("conv", sizes)]);
             }
             ExportForm::Dense { weight, bias } => {
                 let weight = self.array(array("weight"), Values::F32(weight.clone()));

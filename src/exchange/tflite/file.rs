@@ -197,6 +197,18 @@ fn options(b: &mut Builder, options: Options) -> Option<(u8, Table)> {
             };
             (1, table(b, fill))
         }
+        Options::DepthwiseConv2d { is_same, stride: [dy, dx], relu } => {
+            let fill = |b: &mut Builder| {
+                b.push_slot_always(slot(0), padding(is_same));
+                b.push_slot_always(slot(1), dx as i32);
+                b.push_slot_always(slot(2), dy as i32);
+                b.push_slot_always(slot(3), 1i32); // Outputs of a channel.
+                b.push_slot_always(slot(4), activation(relu));
+                b.push_slot_always(slot(5), 1i32);
+                b.push_slot_always(slot(6), 1i32);
+            };
+            (2, table(b, fill))
+        }
         Options::Pool2d { window: [h, w], stride: [dy, dx] } => {
             let fill = |b: &mut Builder| {
                 b.push_slot_always(slot(0), padding(false));

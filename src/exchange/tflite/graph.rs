@@ -46,6 +46,7 @@ pub enum Code {
     AveragePool2d = 1,
     Concatenation = 2,
     Conv2d = 3,
+    DepthwiseConv2d = 4,
     Floor = 8,
     FullyConnected = 9,
     Logistic = 14,
@@ -79,6 +80,11 @@ pub enum Code {
 pub enum Options {
     None,
     Conv2d {
+        is_same: bool,
+        stride: [usize; 2],
+        relu: bool,
+    },
+    DepthwiseConv2d {
         is_same: bool,
         stride: [usize; 2],
         relu: bool,

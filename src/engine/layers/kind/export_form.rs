@@ -26,6 +26,19 @@ pub enum ExportForm {
         /// One value for each filter.
         bias: Vec<f32>,
     },
+    /// A convolution of each channel with a kernel of its own, `weight` `[channels][kernel height][kernel width]`.
+    Depthwise {
+        /// Height and width of the kernel.
+        kernel: [usize; 2],
+        /// Rows and columns from one window to the next.
+        stride: [usize; 2],
+        /// Zeros around the input.
+        pads: Pads,
+        /// The kernels.
+        weight: Vec<f32>,
+        /// One value for each channel.
+        bias: Vec<f32>,
+    },
     /// A fully connected layer, `weight` `[units][inputs]`.
     Dense {
         /// The weights.

@@ -18,8 +18,7 @@ use crate::engine::tensor::Shape;
 /// - **Backward** of `y[c][i][j] = Σ_{k,l} a_k b_l x[c][i·s + k − p][j·s + l − p]`: `dx[c][i·s + k − p][j·s + l − p] += a_k b_l
 ///   dy[c][i][j]`. Needs nothing.
 /// - **Training and evaluation** are the same.
-/// - **Limits** Rows and columns that do not fill a window are left out. The padding is less than the window. Exports write it as a
-///   convolution, which has `c²` kernels.
+/// - **Limits** Rows and columns that do not fill a window are left out. The padding is less than the window.
 ///
 /// # Shapes
 ///
@@ -146,7 +145,8 @@ impl LayerKind for BlurSpec {
         if h > MAX_TAPS || w > MAX_TAPS {
             return Err(format!("window must be at most {MAX_TAPS}, not {h}x{w}"));
         }
-        if input.c.saturating_mul(input.c).saturating_mul(h * w) > MAX_NUMBERS {
+        // Exports write a kernel for each channel.
+        if input.c.saturating_mul(h * w) > MAX_NUMBERS {
             return Err(format!("a blur of {} channels is more than exports can write", input.c));
         }
         check_sizes(&[("stride", self.stride[0]), ("stride", self.stride[1])])
@@ -159,16 +159,11 @@ impl LayerKind for BlurSpec {
     fn export_form(&self, input: Shape, _params: &[f32], _statistics: &[f32]) -> ExportForm {
         let [kh, kw] = self.window;
         let (down, along) = (binomial(kh), binomial(kw));
-        let mut weight = vec![0.0; input.c * input.c * kh * kw];
-        for channel in 0..input.c {
-            let kernel = &mut weight[channel * (input.c + 1) * kh * kw..][..kh * kw];
-            for (k, weight) in kernel.iter_mut().enumerate() {
-                *weight = down[k / kw] * along[k % kw];
-            }
-        }
+        let kernel: Vec<f32> = (0..kh * kw).map(|k| down[k / kw] * along[k % kw]).collect();
+        let weight = kernel.repeat(input.c);
         let [rows, columns] = self.padding;
         let pads = Pads { top: rows, left: columns, bottom: rows, right: columns };
-        ExportForm::Conv { kernel: self.window, stride: self.stride, pads, weight, bias: vec![0.0; input.c] }
+        ExportForm::Depthwise { kernel: self.window, stride: self.stride, pads, weight, bias: vec![0.0; input.c] }
     }
 }
 
@@ -233,6 +228,14 @@ mod tests {
             let error = spec.build(Shape::new(1, 9, 9), Isa::PORTABLE).unwrap_err();
             assert!(error.contains("padding"), "{error}");
         }
+    }
+
+    #[test]
+    fn more_channels_than_exports_can_write_are_refused() {
+        let spec = BlurSpec { window: [3, 3], stride: [1, 1], padding: [0, 0] };
+        assert_eq!(spec.check(Shape::new(MAX_NUMBERS / 9, 3, 3)), Ok(()));
+        let error = spec.check(Shape::new(MAX_NUMBERS / 9 + 1, 3, 3)).unwrap_err();
+        assert!(error.contains("channels"), "{error}");
     }
 
     #[test]
