@@ -16,7 +16,7 @@ const BAND: usize = 16;
 /// The sizes of a blur.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct BlurShape {
-    /// The map and the windows. Those that reach into the padding count too, so its own `out_h` and `out_w` are not the output's.
+    /// The map and the windows. Use [`BlurShape::out_h`] and [`BlurShape::out_w`]: those of this field know nothing of the padding.
     pub windows: PoolShape,
     /// Rows of zeros above the map and as many below it, fewer than the window's.
     pub pad_h: usize,

@@ -1,6 +1,6 @@
 //! Grey levels of a picture, as bytes: to floats, and changed at random.
 //!
-//! Integers alone decide what noise changes, so it is the same for every instruction set.
+//! All instruction sets give the same bytes: noise is made of integers, and products and sums of floats are never fused here.
 
 use crate::dropout::random_bits;
 
@@ -46,8 +46,11 @@ per_isa! {
 }
 
 per_isa! {
-    /// Adds `constant[x] + factor * slope[x]`, rounded, to the three grey levels of pixel `x`; 0 and 255 are the limits. Errors are within
-    /// ±256.
+    /// Adds `constant[x] + factor * slope[x]`, rounded, to the three grey levels of pixel `x`; 0 and 255 are the limits. The sum must lie
+    /// within ±256.
+    ///
+    /// # Panics
+    /// If the slices do not belong to as many pixels.
     pub fn add_grey<S>(_simd: S, constant: &[f32], slope: &[f32], factor: f32, rgb: &mut [u8]) {
         /// Pixels at a time.
         const PIXELS: usize = 64;
@@ -71,7 +74,7 @@ per_isa! {
 
 per_isa! {
     /// Multiplies the colour of each pixel, three bytes, by `matrix` and adds `offset` to each channel; what is behind the decimal point is
-    /// cut off, and 0 and 255 are the limits.
+    /// cut off, and 0 and 255 are the limits. Bytes behind the last whole pixel stay as they are.
     pub fn recolour<S>(_simd: S, matrix: &[[f32; 3]; 3], offset: f32, rgb: &mut [u8]) {
         /// Pixels whose channels are taken apart at a time, so that vectors hold one channel each.
         const PIXELS: usize = 64;

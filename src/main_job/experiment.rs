@@ -90,7 +90,7 @@ impl Subject {
                     block_noise,
                     ..base.augmentation.clone()
                 };
-                let none = angular(&unblurred(&base.layers));
+                let none = with_relu(&unblurred(&base.layers));
                 let plain = || Recipe {
                     averaging: None,
                     smoothness: None,
@@ -101,7 +101,7 @@ impl Subject {
                 let augmentation = with_noise(NOISE);
                 let averaging = Some(AveragingSpec::Ema { decay: DECAY, from_share: 0.0, refit_batches: 0 });
                 let terms = |spatial, temporal| Some(Smoothness { spatial, temporal, ..Smoothness::default() });
-                let layers = blurred(&rounded(&none));
+                let layers = blurred(&with_elu(&none));
                 vec![
                     ("plain", plain()),
                     ("averaged", Recipe { averaging, ..plain() }),
@@ -109,7 +109,7 @@ impl Subject {
                     ("spatial", Recipe { smoothness: terms(TERM, 0.0), ..plain() }),
                     ("temporal", Recipe { smoothness: terms(0.0, TERM), ..plain() }),
                     ("blur", Recipe { layers: blurred(&none), ..plain() }),
-                    ("elu", Recipe { layers: rounded(&none), ..plain() }),
+                    ("elu", Recipe { layers: with_elu(&none), ..plain() }),
                     (
                         "blur+noise+elu",
                         Recipe { layers: layers.clone(), augmentation: augmentation.clone(), ..plain() },
@@ -133,24 +133,24 @@ fn blurred(layers: &[LayerSpec]) -> Vec<LayerSpec> {
     blurred
 }
 
-/// `layers` without their blurs.
+/// `layers` without their blurs, those of a recipe of one's own included.
 fn unblurred(layers: &[LayerSpec]) -> Vec<LayerSpec> {
     layers.iter().filter(|layer| !matches!(layer, LayerSpec::Blur(_))).cloned().collect()
 }
 
 /// `layers` with ELU in place of ReLU, but for those behind a batch normalisation, with which ReLU is computed in one pass.
-fn rounded(layers: &[LayerSpec]) -> Vec<LayerSpec> {
-    let mut rounded = layers.to_vec();
-    for (layer, before) in rounded.iter_mut().skip(1).zip(layers) {
+fn with_elu(layers: &[LayerSpec]) -> Vec<LayerSpec> {
+    let mut changed = layers.to_vec();
+    for (layer, before) in changed.iter_mut().skip(1).zip(layers) {
         if matches!((&*layer, before), (LayerSpec::Relu(_), before) if !matches!(before, LayerSpec::BatchNorm(_))) {
             *layer = LayerSpec::Elu(EluSpec { alpha: 1.0 });
         }
     }
-    rounded
+    changed
 }
 
 /// `layers` with ReLU in place of ELU.
-fn angular(layers: &[LayerSpec]) -> Vec<LayerSpec> {
+fn with_relu(layers: &[LayerSpec]) -> Vec<LayerSpec> {
     let relu = |layer: &LayerSpec| match layer {
         LayerSpec::Elu(_) => LayerSpec::Relu(ReluSpec {}),
         other => other.clone(),

@@ -330,6 +330,12 @@ fn noise_is_the_same_on_every_instruction_set_even_and_held_between_black_and_wh
 }
 
 #[test]
+#[should_panic(expected = "more than 256")]
+fn noise_that_would_not_fit_16_bits_is_refused() {
+    pixels::add_noise(steersman_kernels::Isa::PORTABLE, [1, 2], 257, &mut [0; 4]);
+}
+
+#[test]
 fn pixels_agree_with_the_loops() {
     let mut failures = Failures::default();
     for isa in isas() {

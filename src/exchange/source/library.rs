@@ -292,9 +292,9 @@ fn conv2d(x: &[f32], y: &mut [f32], weight: &[f32], bias: &[f32], s: Conv) {
 /// The convolution of each channel alone, weights `[c][kernel_h][kernel_w]`.
 fn depthwise(x: &[f32], y: &mut [f32], weight: &[f32], bias: &[f32], s: Conv) {
     let maps = x.chunks_exact(s.h * s.w).zip(y.chunks_exact_mut(s.out_h * s.out_w));
-    let kernels = weight.chunks_exact(s.kernel_h * s.kernel_w).zip(bias.chunks_exact(1));
+    let kernels = weight.chunks_exact(s.kernel_h * s.kernel_w).zip(bias);
     for ((x, y), (kernel, bias)) in maps.zip(kernels) {
-        conv2d(x, y, kernel, bias, Conv { c: 1, filters: 1, ..s });
+        conv2d(x, y, kernel, core::slice::from_ref(bias), Conv { c: 1, filters: 1, ..s });
     }
 }
 

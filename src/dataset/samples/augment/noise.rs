@@ -113,9 +113,41 @@ mod tests {
         assert!(
             Augmentation { block_noise: -1.0, ..noise }.validate().unwrap_err().to_string().contains("block_noise")
         );
-        // Black and white are held.
-        let mut rgb = [0, 255].repeat(12);
-        block_noise(&mut rgb, 4, [4, 4], 60.0, &mut rng(1, Purpose::Test, 0, 0));
-        assert!(rgb.contains(&0) || rgb.contains(&255));
+        // Black and white are held: no error reaches 192 grey levels.
+        let mut rgb = [0u8, 255].repeat(3 * 800);
+        block_noise(&mut rgb, 40, [4, 4], 60.0, &mut rng(1, Purpose::Test, 0, 0));
+        assert!(rgb.iter().step_by(2).all(|grey| *grey < 192) && rgb.iter().step_by(2).any(|grey| *grey == 0));
+        assert!(
+            rgb.iter().skip(1).step_by(2).all(|grey| *grey > 63)
+                && rgb.iter().skip(1).step_by(2).any(|grey| *grey == 255)
+        );
+    }
+
+    #[test]
+    fn block_noise_follows_its_waves_in_blocks_that_are_cut_and_in_pictures_of_several_strips() {
+        for (height, width, block) in [(13, 150, [5, 6]), (70, 130, [64, 64]), (3, 1, [1, 1]), (9, 65, [4, 4])] {
+            let mut rgb = vec![128; height * width * 3];
+            block_noise(&mut rgb, width, block, 20.0, &mut rng(3, Purpose::Test, 0, 0));
+            // The same draws: rows of blocks, in each from left to right.
+            let random = &mut rng(3, Purpose::Test, 0, 0);
+            let wave = |at: usize, side: usize| (std::f64::consts::PI * (at as f64 + 0.5) / side as f64).cos();
+            for top in (0..height).step_by(block[0]) {
+                for left in (0..width).step_by(block[1]) {
+                    let [constant, down, along] = [(); 3].map(|()| uniform(random, -20.0, 20.0));
+                    for y in top..height.min(top + block[0]) {
+                        for x in left..width.min(left + block[1]) {
+                            let error = constant + down * wave(y - top, block[0]) + along * wave(x - left, block[1]);
+                            let found = &rgb[(y * width + x) * 3..][..3];
+                            let what = format!("{height}x{width} in {block:?} at {y}, {x}: {found:?} for {error}");
+                            // Single precision may decide a half otherwise.
+                            assert!(
+                                found.iter().all(|grey| (f64::from(*grey) - 128.0 - error).abs() < 0.5001),
+                                "{what}"
+                            );
+                        }
+                    }
+                }
+            }
+        }
     }
 }

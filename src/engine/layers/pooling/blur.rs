@@ -49,7 +49,9 @@ impl Blur {
             return Err(format!("a padding of {padding} is not less than the {window} window"));
         }
         let padded = Shape::new(input.c, input.h + 2 * pad_h, input.w + 2 * pad_w);
-        let windows = PoolShape { h: input.h, w: input.w, ..pool_shape(padded, window, stride)? };
+        let windows = pool_shape(padded, window, stride)
+            .map_err(|message| if padding == [0, 0] { message } else { format!("{message} with its padding") })?;
+        let windows = PoolShape { h: input.h, w: input.w, ..windows };
         Ok(Blur { shape: BlurShape { windows, pad_h, pad_w }, isa })
     }
 }
@@ -126,10 +128,13 @@ impl LayerKind for BlurSpec {
     }
 
     fn describe(&self) -> String {
-        match self.stride {
-            [1, 1] => format!("blur {}", pair(self.window)),
-            stride => format!("blur {} stride {}", pair(self.window), pair(stride)),
+        let mut text = format!("blur {}", pair(self.window));
+        for (word, sizes, default) in [("stride", self.stride, [1, 1]), ("padding", self.padding, [0, 0])] {
+            if sizes != default {
+                text += &format!(" {word} {}", pair(sizes));
+            }
         }
+        text
     }
 
     fn family(&self) -> Family {
@@ -148,6 +153,12 @@ impl LayerKind for BlurSpec {
         // Exports write a kernel for each channel.
         if input.c.saturating_mul(h * w) > MAX_NUMBERS {
             return Err(format!("a blur of {} channels is more than exports can write", input.c));
+        }
+        // The output is not larger than the map with its padding.
+        let [rows, columns] = [(input.h, self.padding[0]), (input.w, self.padding[1])]
+            .map(|(inside, padding)| inside.saturating_add(padding.saturating_mul(2)));
+        if rows.saturating_mul(columns).saturating_mul(input.c) > MAX_NUMBERS {
+            return Err(format!("the map with its padding would have more than {MAX_NUMBERS} numbers"));
         }
         check_sizes(&[("stride", self.stride[0]), ("stride", self.stride[1])])
     }
@@ -236,6 +247,26 @@ mod tests {
         assert_eq!(spec.check(Shape::new(MAX_NUMBERS / 9, 3, 3)), Ok(()));
         let error = spec.check(Shape::new(MAX_NUMBERS / 9 + 1, 3, 3)).unwrap_err();
         assert!(error.contains("channels"), "{error}");
+    }
+
+    #[test]
+    fn a_blur_cannot_make_a_map_larger_than_any_layer_may() {
+        let spec = BlurSpec { window: [7, 7], stride: [1, 1], padding: [6, 6] };
+        assert_eq!(spec.check(Shape::new(1, 8180, 8180)), Ok(()));
+        for shape in [Shape::new(1, 8181, 8181), Shape::new(MAX_NUMBERS / 100, 1, 1)] {
+            let error = spec.check(shape).unwrap_err();
+            assert!(error.contains("map with its padding"), "{error}");
+        }
+    }
+
+    #[test]
+    fn padding_is_told_where_there_is_any() {
+        let blur = |stride, padding| BlurSpec { window: [3, 5], stride, padding }.describe();
+        assert_eq!(blur([1, 1], [0, 0]), "blur 3x5");
+        assert_eq!(blur([2, 1], [1, 0]), "blur 3x5 stride 2x1 padding 1x0");
+        let new = |padding| Blur::new(Shape::new(1, 2, 2), [5, 5], [1, 1], padding, Isa::PORTABLE).unwrap_err();
+        assert_eq!(new([0, 0]), "a 5x5 window does not fit into the 2x2 input");
+        assert_eq!(new([1, 1]), "a 5x5 window does not fit into the 4x4 input with its padding");
     }
 
     #[test]
