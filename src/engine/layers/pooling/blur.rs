@@ -44,9 +44,11 @@ impl Blur {
     ) -> Result<Blur, String> {
         let [pad_h, pad_w] = padding;
         // A window without any input would be a row of zeros.
-        if pad_h >= window[0].max(1) || pad_w >= window[1].max(1) {
-            let (padding, window) = (pair(padding), pair(window));
-            return Err(format!("a padding of {padding} is not less than the {window} window"));
+        for (what, pad, size) in [("rows", pad_h, window[0]), ("columns", pad_w, window[1])] {
+            if pad >= size.max(1) {
+                let most = size.saturating_sub(1);
+                return Err(format!("a padding of {pad} {what} in a window of {size}: {most} at most"));
+            }
         }
         let padded = Shape::new(input.c, input.h + 2 * pad_h, input.w + 2 * pad_w);
         let windows = pool_shape(padded, window, stride)
