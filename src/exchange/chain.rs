@@ -20,9 +20,7 @@ impl ChainStep {
     /// Number of weights or slopes.
     pub fn weight_len(&self) -> usize {
         match &self.form {
-            ExportForm::Conv { weight, .. }
-            | ExportForm::Depthwise { weight, .. }
-            | ExportForm::Dense { weight, .. } => weight.len(),
+            ExportForm::Conv { weight, .. } | ExportForm::Dense { weight, .. } => weight.len(),
             ExportForm::PRelu { slopes } => slopes.len(),
             ExportForm::Identity
             | ExportForm::Elementwise(_)
@@ -75,9 +73,9 @@ pub(crate) fn check_finite(steps: &[ChainStep]) -> Result<()> {
     let all_finite = |values: &[f32]| values.iter().all(|value| value.is_finite());
     for ChainStep { name, form, .. } in steps {
         let is_finite = match form {
-            ExportForm::Conv { weight, bias, .. }
-            | ExportForm::Depthwise { weight, bias, .. }
-            | ExportForm::Dense { weight, bias } => all_finite(weight) && all_finite(bias),
+            ExportForm::Conv { weight, bias, .. } | ExportForm::Dense { weight, bias } => {
+                all_finite(weight) && all_finite(bias)
+            }
             ExportForm::BatchNorm { gamma, beta, mean, variance, epsilon } => {
                 let ChannelAffine { scale, shift } = scale_and_shift(gamma, beta, mean, variance, *epsilon);
                 scale.iter().chain(&shift).all(|value| (*value as f32).is_finite())
@@ -134,11 +132,7 @@ pub(crate) fn fold_batch_norm(chain: Vec<ChainStep>) -> Vec<ChainStep> {
         let before = folded.last_mut().map(|step| &mut step.form);
         match (before, &step.form) {
             (
-                Some(
-                    ExportForm::Conv { weight, bias, .. }
-                    | ExportForm::Depthwise { weight, bias, .. }
-                    | ExportForm::Dense { weight, bias },
-                ),
+                Some(ExportForm::Conv { weight, bias, .. } | ExportForm::Dense { weight, bias }),
                 ExportForm::BatchNorm { gamma, beta, mean, variance, epsilon },
             ) => {
                 let ChannelAffine { scale, shift } = scale_and_shift(gamma, beta, mean, variance, *epsilon);
@@ -241,7 +235,8 @@ mod tests {
         let shape = Shape::new(2, 1, 2);
         let step = |form| ChainStep { name: String::new(), input: shape, output: shape, form };
         let pads = Pads { top: 0, left: 0, bottom: 0, right: 1 };
-        let depthwise = |weight: [f32; 4], bias: [f32; 2]| ExportForm::Depthwise {
+        let depthwise = |weight: [f32; 4], bias: [f32; 2]| ExportForm::Conv {
+            depthwise: true,
             kernel: [1, 2],
             stride: [1, 1],
             pads,

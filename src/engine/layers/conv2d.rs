@@ -276,7 +276,8 @@ impl LayerKind for Conv2dSpec {
         let (top, bottom) = padding.amounts(input.h, kernel[0], stride[0]);
         let (left, right) = padding.amounts(input.w, kernel[1], stride[1]);
         let (weight, bias) = weight_and_bias(params, filters);
-        ExportForm::Conv { kernel, stride, pads: Pads { top, left, bottom, right }, weight, bias }
+        let pads = Pads { top, left, bottom, right };
+        ExportForm::Conv { depthwise: false, kernel, stride, pads, weight, bias }
     }
 }
 

@@ -100,7 +100,6 @@ fn network(graph: &mut GraphBuilder, steps: &[ChainStep], input: &str, outputs: 
     for step in steps {
         let takes = match step.form {
             ExportForm::Conv { .. }
-            | ExportForm::Depthwise { .. }
             | ExportForm::MaxPool { .. }
             | ExportForm::AveragePool { .. }
             | ExportForm::Crop { .. }
@@ -146,9 +145,8 @@ fn operation(graph: &mut GraphBuilder, step: &ChainStep, x: &str, is_map: bool) 
     let ChainStep { name, input, output, form } = step;
     let constant = |what: &str| format!("{name}.{what}");
     match form {
-        ExportForm::Conv { kernel, stride, pads, weight, bias }
-        | ExportForm::Depthwise { kernel, stride, pads, weight, bias } => {
-            let group = if matches!(form, ExportForm::Conv { .. }) { 1 } else { input.c };
+        ExportForm::Conv { depthwise, kernel, stride, pads, weight, bias } => {
+            let group = if *depthwise { input.c } else { 1 };
             let weight = graph.floats(&constant("weight"), &[output.c, input.c / group, kernel[0], kernel[1]], weight);
             let bias = graph.floats(&constant("bias"), &[output.c], bias);
             let pads = ints("pads", &[pads.top, pads.left, pads.bottom, pads.right]);

@@ -335,9 +335,8 @@ impl<'a> Program<'a> {
         let array = |what: &str| format!("{name}_{what}");
         let change = |program: &Program| Arg::Change(program.result, input.len());
         match form {
-            ExportForm::Conv { kernel, stride, pads, weight, bias }
-            | ExportForm::Depthwise { kernel, stride, pads, weight, bias } => {
-                let function = if matches!(form, ExportForm::Conv { .. }) { "conv2d" } else { "depthwise" };
+            ExportForm::Conv { depthwise, kernel, stride, pads, weight, bias } => {
+                let function = if *depthwise { "depthwise" } else { "conv2d" };
                 let weight = self.array(array("weight"), Values::F32(weight.clone()));
                 let bias = self.array(array("bias"), Values::F32(bias.clone()));
                 let mut sizes = map_sizes(*input);

@@ -186,28 +186,23 @@ fn options(b: &mut Builder, options: Options) -> Option<(u8, Table)> {
     let activation = |relu: bool| i8::from(relu);
     let written = match options {
         Options::None => return None,
-        Options::Conv2d { is_same, stride: [dy, dx], relu } => {
+        Options::Conv2d { depthwise, is_same, stride: [dy, dx], relu } => {
             let fill = |b: &mut Builder| {
                 b.push_slot_always(slot(0), padding(is_same));
                 b.push_slot_always(slot(1), dx as i32);
                 b.push_slot_always(slot(2), dy as i32);
-                b.push_slot_always(slot(3), activation(relu));
-                b.push_slot_always(slot(4), 1i32);
-                b.push_slot_always(slot(5), 1i32);
+                // `depth_multiplier`, the outputs of a channel.
+                let rest = if depthwise {
+                    b.push_slot_always(slot(3), 1i32);
+                    4
+                } else {
+                    3
+                };
+                b.push_slot_always(slot(rest), activation(relu));
+                b.push_slot_always(slot(rest + 1), 1i32);
+                b.push_slot_always(slot(rest + 2), 1i32);
             };
-            (1, table(b, fill))
-        }
-        Options::DepthwiseConv2d { is_same, stride: [dy, dx], relu } => {
-            let fill = |b: &mut Builder| {
-                b.push_slot_always(slot(0), padding(is_same));
-                b.push_slot_always(slot(1), dx as i32);
-                b.push_slot_always(slot(2), dy as i32);
-                b.push_slot_always(slot(3), 1i32); // Outputs of a channel.
-                b.push_slot_always(slot(4), activation(relu));
-                b.push_slot_always(slot(5), 1i32);
-                b.push_slot_always(slot(6), 1i32);
-            };
-            (2, table(b, fill))
+            (if depthwise { 2 } else { 1 }, table(b, fill))
         }
         Options::Pool2d { window: [h, w], stride: [dy, dx] } => {
             let fill = |b: &mut Builder| {

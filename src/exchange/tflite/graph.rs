@@ -80,11 +80,7 @@ pub enum Code {
 pub enum Options {
     None,
     Conv2d {
-        is_same: bool,
-        stride: [usize; 2],
-        relu: bool,
-    },
-    DepthwiseConv2d {
+        depthwise: bool,
         is_same: bool,
         stride: [usize; 2],
         relu: bool,

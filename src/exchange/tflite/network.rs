@@ -27,9 +27,8 @@ pub fn add(graph: &mut Graph, steps: &[ChainStep], input: &str) -> String {
     let mut steps = steps.iter().peekable();
     while let Some(step) = steps.next() {
         let relu = Function::Relu.of(Formula::X);
-        let is_before_relu =
-            matches!(step.form, ExportForm::Conv { .. } | ExportForm::Depthwise { .. } | ExportForm::Dense { .. })
-                && steps.next_if(|next| next.form == ExportForm::Elementwise(relu)).is_some();
+        let is_before_relu = matches!(step.form, ExportForm::Conv { .. } | ExportForm::Dense { .. })
+            && steps.next_if(|next| next.form == ExportForm::Elementwise(relu)).is_some();
         value = operation(graph, step, value, is_before_relu);
     }
     vector(graph, "vector", value)
@@ -100,24 +99,19 @@ fn operation(graph: &mut Graph, step: &ChainStep, value: Value, relu: bool) -> V
     let constant = |what: &str| format!("{name}.{what}");
     let is_map = |tensor: String| Value { tensor, layout: Layout::Map };
     match form {
-        ExportForm::Conv { kernel, stride, pads, weight, bias }
-        | ExportForm::Depthwise { kernel, stride, pads, weight, bias } => {
+        ExportForm::Conv { depthwise, kernel, stride, pads, weight, bias } => {
             let x = map(graph, name, value);
             let is_same = *pads == same_pads(*input, *kernel, *stride);
             let Pads { top, left, bottom, right } = *pads;
             let around = if is_same { [0; 4] } else { [top, left, bottom, right] };
             let x = graph.pad(&constant("pad"), &x, around);
             let [h, w] = *kernel;
-            let (stride, is_conv) = (*stride, matches!(form, ExportForm::Conv { .. }));
-            let (code, options, kernels) = if is_conv {
-                (Code::Conv2d, Options::Conv2d { is_same, stride, relu }, output.c)
-            } else {
-                (Code::DepthwiseConv2d, Options::DepthwiseConv2d { is_same, stride, relu }, 1)
-            };
             // A depthwise convolution has one kernel that is as deep as the map.
+            let (code, kernels) = if *depthwise { (Code::DepthwiseConv2d, 1) } else { (Code::Conv2d, output.c) };
             let weight = reordered(weight, Shape::new(input.c, h, w));
             let weight = graph.floats(&constant("weight"), &[kernels, h, w, input.c], &weight);
             let bias = graph.floats(&constant("bias"), &[output.c], bias);
+            let options = Options::Conv2d { depthwise: *depthwise, is_same, stride: *stride, relu };
             is_map(graph.operator(code, name, &[&x, &weight, &bias], options, &map_dims))
         }
         ExportForm::Dense { weight, bias } => {

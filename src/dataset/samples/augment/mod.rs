@@ -87,8 +87,8 @@ pub struct Augmentation {
     /// Range of the factor of the distance from the picture's mean grey level.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub contrast: Option<[f64; 2]>,
-    /// Noise like a JPEG's, which changes from frame to frame: an error of each block of 8x8 source pixels (at most 64x64 of the cropped picture) in the three coarsest
-    /// coefficients of its cosine transform, in brightness. Each error is drawn up to an amplitude in grey levels, and the amplitude of a
+    /// Noise like a JPEG's, which changes from frame to frame: an error of each block of 8x8 source pixels (at most 64x64 of the cropped
+    /// picture) in the three coarsest coefficients of its cosine transform, in brightness. Each error is drawn up to an amplitude in grey levels, and the amplitude of a
     /// picture between 0 and this.
     #[serde(skip_serializing_if = "is_zero")]
     pub block_noise: f64,

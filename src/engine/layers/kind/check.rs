@@ -10,7 +10,7 @@ use crate::engine::tensor::Shape;
 /// Asks `kind` all questions of [`LayerKind`] and checks the answers on inputs of shape `input`.
 ///
 /// - The receptive field is measured: each input value is moved, and the outputs that change must be those that see it.
-/// - An elementwise formula and a depthwise convolution give what the layer computes; a layer left out of exports computes nothing.
+/// - An elementwise formula and a convolution give what the layer computes; a layer left out of exports computes nothing.
 /// - Name, family and receptive field go together.
 ///
 /// Small inputs will do: the layer runs twice for each input value.
@@ -81,25 +81,29 @@ pub fn check_kind(kind: &dyn LayerKind, input: Shape) {
             }
         }
         ExportForm::Identity => assert_eq!(y, harness.x, "{kind:?} is left out of exports, but computes something"),
-        ExportForm::Depthwise { kernel, stride, pads, weight, bias } => {
+        ExportForm::Conv { depthwise, kernel, stride, pads, weight, bias } => {
             let padded = [input.h + pads.top + pads.bottom, input.w + pads.left + pads.right];
             let [h, w] = [0, 1].map(|axis| (padded[axis] - kernel[axis]) / stride[axis] + 1);
-            assert_eq!(layer.output(), Shape::new(input.c, h, w), "{kind:?}");
+            assert_eq!(layer.output(), Shape::new(bias.len(), h, w), "{kind:?}");
+            // Channels that a filter sees.
+            let depth = if depthwise { 1 } else { input.c };
+            let taps = depth * kernel[0] * kernel[1];
             for (o, y) in y.iter().enumerate() {
-                let (c, i, j) = (o / (h * w), o / w % h, o % w);
-                let term = |k: usize| {
+                let (filter, i, j) = (o / (h * w), o / w % h, o % w);
+                let term = |tap: usize| {
+                    let (channel, k) = (tap / (kernel[0] * kernel[1]), tap % (kernel[0] * kernel[1]));
+                    let c = if depthwise { filter } else { channel };
                     let row = (i * stride[0] + k / kernel[1]).checked_sub(pads.top).filter(|row| *row < input.h)?;
                     let column = (j * stride[1] + k % kernel[1]).checked_sub(pads.left).filter(|at| *at < input.w)?;
                     let x = harness.x[(c * input.h + row) * input.w + column];
-                    Some(f64::from(weight[c * kernel[0] * kernel[1] + k]) * f64::from(x))
+                    Some(f64::from(weight[filter * taps + tap]) * f64::from(x))
                 };
-                let expected = f64::from(bias[c]) + (0..kernel[0] * kernel[1]).filter_map(term).sum::<f64>();
+                let expected = f64::from(bias[filter]) + (0..taps).filter_map(term).sum::<f64>();
                 let error = (f64::from(*y) - expected).abs();
                 assert!(error <= 1e-5 * expected.abs().max(1.0), "{kind:?} gives {y} at {o}, its export {expected}");
             }
         }
-        ExportForm::Conv { .. }
-        | ExportForm::Dense { .. }
+        ExportForm::Dense { .. }
         | ExportForm::BatchNorm { .. }
         | ExportForm::PRelu { .. }
         | ExportForm::MaxPool { .. }

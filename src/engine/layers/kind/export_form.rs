@@ -13,8 +13,11 @@ pub enum ExportForm {
     Identity,
     /// The same formula of each value.
     Elementwise(Formula),
-    /// A convolution, `weight` `[filters][channels][kernel height][kernel width]`.
+    /// A convolution, `weight` `[filters][channels][kernel height][kernel width]`; a depthwise one has a filter for each channel, which
+    /// sees that channel alone: `[channels][1][kernel height][kernel width]`.
     Conv {
+        /// Whether each filter sees one channel.
+        depthwise: bool,
         /// Height and width of the kernel.
         kernel: [usize; 2],
         /// Rows and columns from one window to the next.
@@ -24,19 +27,6 @@ pub enum ExportForm {
         /// The kernels.
         weight: Vec<f32>,
         /// One value for each filter.
-        bias: Vec<f32>,
-    },
-    /// A convolution of each channel with a kernel of its own, `weight` `[channels][kernel height][kernel width]`.
-    Depthwise {
-        /// Height and width of the kernel.
-        kernel: [usize; 2],
-        /// Rows and columns from one window to the next.
-        stride: [usize; 2],
-        /// Zeros around the input.
-        pads: Pads,
-        /// The kernels.
-        weight: Vec<f32>,
-        /// One value for each channel.
         bias: Vec<f32>,
     },
     /// A fully connected layer, `weight` `[units][inputs]`.

@@ -176,7 +176,8 @@ impl LayerKind for BlurSpec {
         let weight = kernel.repeat(input.c);
         let [rows, columns] = self.padding;
         let pads = Pads { top: rows, left: columns, bottom: rows, right: columns };
-        ExportForm::Depthwise { kernel: self.window, stride: self.stride, pads, weight, bias: vec![0.0; input.c] }
+        let (kernel, stride, bias) = (self.window, self.stride, vec![0.0; input.c]);
+        ExportForm::Conv { depthwise: true, kernel, stride, pads, weight, bias }
     }
 }
 
