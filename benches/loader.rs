@@ -1,9 +1,11 @@
-//! From a file's bytes to network input, one image on one thread, for each shipped recipe; and the view from beside the path of
-//! 80x320 pixels.
+//! From a file's bytes to network input, one image on one thread, for each shipped recipe; the changes of the recipe `default`, all
+//! and without noise; and the view from beside the path of 80x320 pixels.
 
 use std::hint::black_box;
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
+use steersman::dataset::augment::Augmentation;
+use steersman::engine::random::{Purpose, rng};
 use steersman::geometry::{CarGeometry, Offset, PixelGrid, ViewWarp};
 use steersman::picture::{RgbImage, decode::decode_rgb};
 use steersman::recipe::{Recipe, SHIPPED};
@@ -17,6 +19,8 @@ fn loader(c: &mut Criterion) {
     let mut group = c.benchmark_group("one image");
     group.throughput(Throughput::Elements(1));
     let mut image = RgbImage::default();
+    // Also where a filter leaves the next line out.
+    decode_rgb(&jpeg, &mut image).expect("the sample is a JPEG");
     group.bench_function("decode", |b| b.iter(|| decode_rgb(&jpeg, &mut image)));
     for (name, _) in SHIPPED {
         let preprocessing = Recipe::find(name, &[]).expect("the recipe is built in").preprocessing;
@@ -26,6 +30,18 @@ fn loader(c: &mut Criterion) {
             b.iter(|| {
                 preprocessor.apply(&image.pixels, &mut planes);
                 preprocessing.to_input(&planes, &mut input);
+            });
+        });
+    }
+    let Recipe { augmentation, preprocessing, .. } = Recipe::find("default", &[]).expect("the recipe is built in");
+    let without_noise = Augmentation { pixel_noise: 0.0, block_noise: 0.0, ..augmentation.clone() };
+    let [height, width] = preprocessing.rgb_size();
+    for (what, augmentation) in [("augment", augmentation), ("augment without noise", without_noise)] {
+        let (mut rgb, mut rng) = (vec![100; height * width * 3], rng(1, Purpose::Test, 0, 0));
+        group.bench_function(format!("{what} for default"), |b| {
+            b.iter(|| {
+                rgb.fill(black_box(100));
+                augmentation.apply(&preprocessing, &mut rgb, &mut rng)
             });
         });
     }
