@@ -35,13 +35,14 @@ pub enum Subject {
     Colour,
     /// What labels are: the recorded wheel, or the steering that follows the driven path, with look-aheads of 0.7, 1.0 and 1.3 s.
     Labels,
-    /// What makes the wheel calm: the recipe with none of them, averaged weights, noise in the pictures, each term of smoothness, blur before
-    /// each stride, ELU in place of ReLU, the last two and noise, all of them.
+    /// What makes the wheel calm: the recipe with none of them, larger batches, averaged weights, noise in the pictures, each term of
+    /// smoothness, blur before each stride, ELU in place of ReLU, the last two and noise, all of them but the larger batches.
     Smooth,
 }
 
-/// Decay of the averaged weights, amplitudes of the noise of pixels and blocks in grey levels, and weights of the smoothness terms, of
+/// Factor of the larger batches, decay of the averaged weights, amplitudes of the noise of pixels and blocks in grey levels, and weights of the smoothness terms, of
 /// [`Subject::Smooth`].
+const LARGER: usize = 4;
 const DECAY: f64 = 0.998;
 const NOISE: [f64; 2] = [48.0, 16.0];
 const TERM: f64 = 2.0;
@@ -104,6 +105,7 @@ impl Subject {
                 let layers = blurred(&with_elu(&none));
                 vec![
                     ("plain", plain()),
+                    ("larger batches", Recipe { batch: LARGER * base.batch, ..plain() }),
                     ("averaged", Recipe { averaging, ..plain() }),
                     ("noise", Recipe { augmentation: augmentation.clone(), ..plain() }),
                     ("spatial", Recipe { smoothness: terms(TERM, 0.0), ..plain() }),
@@ -374,6 +376,7 @@ mod tests {
                     recipe.preprocessing.colour = base.preprocessing.colour;
                     (recipe.averaging, recipe.smoothness) = (base.averaging, base.smoothness);
                     recipe.augmentation.clone_from(&base.augmentation);
+                    recipe.batch = base.batch;
                     recipe.labels = base.labels;
                     recipe.layers.clone_from(&base.layers);
                     assert_eq!(recipe, base);
@@ -415,6 +418,7 @@ mod tests {
         let none = [0, 0, 5];
         let expected = [
             ("plain", ([0, 0, 0], none)),
+            ("larger batches", ([0, 0, 0], none)),
             ("averaged", ([1, 0, 0], none)),
             ("noise", ([0, 1, 0], none)),
             ("spatial", ([0, 0, 1], none)),
@@ -425,8 +429,10 @@ mod tests {
             ("together", ([1, 1, 1], [3, 2, 3])),
         ];
         assert_eq!(found, expected);
+        let batches: Vec<_> = variants.iter().map(|(_, recipe)| recipe.batch).collect();
+        assert!(batches[1] == 4 * base.batch && [&batches[..1], &batches[2..]].concat() == [base.batch; 9]);
         // The three that cost no laps make `default`.
-        assert_eq!((&variants[7].1.layers, &variants[7].1.augmentation), (&base.layers, &base.augmentation));
+        assert_eq!(variants[8].1, base);
     }
 
     #[test]

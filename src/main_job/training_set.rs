@@ -195,13 +195,15 @@ mod tests {
 
     #[test]
     fn a_recipe_that_looks_farther_ahead_has_a_set_of_its_own() {
-        let [default, calm] = ["default", "calm"].map(|name| Recipe::find(name, &[]).unwrap());
         let takes = takes();
-        assert_eq!(labelled(&takes, &default), takes);
-        let ahead = labelled(&takes, &calm);
-        assert!(ahead.iter().all(|take| take.options(None).label_ahead_m == Some(10.0)));
-        assert!(settings(&ahead, None).unwrap() != settings(&takes, None).unwrap());
-        assert!(!settings(&takes, None).unwrap().contains("label_ahead_m"));
+        let [own, eight, ten] =
+            ["lenet", "default", "calm"].map(|name| labelled(&takes, &Recipe::find(name, &[]).unwrap()));
+        assert_eq!(own, takes);
+        for (ahead, metres) in [(&eight, 8.0), (&ten, 10.0)] {
+            assert!(ahead.iter().all(|take| take.options(None).label_ahead_m == Some(metres)));
+        }
+        let [own, eight, ten] = [&own, &eight, &ten].map(|takes| settings(takes, None).unwrap());
+        assert!(own != eight && own != ten && eight != ten && !own.contains("label_ahead_m"));
     }
 
     #[test]

@@ -250,6 +250,7 @@ pub(super) struct RecordSettings {
     seed: u64,
     speed_mph: f64,
     slower_in_bends_mps2: Option<f64>,
+    label_ahead_m: Option<f64>,
     noise: f64,
     hz: u64,
     format: String,
@@ -281,7 +282,7 @@ pub(super) fn record(
         seed,
         speed_mph,
         bends_mps2: settings.slower_in_bends_mps2,
-        label_ahead_m: None,
+        label_ahead_m: settings.label_ahead_m,
         noise,
         hz,
         format: match settings.format.as_str() {

@@ -89,6 +89,11 @@ def test_a_recording_is_that_of_the_command_line(lake, steersman_program, tmp_pa
         assert (lake / name).read_bytes() == (tmp_path / "lake" / name).read_bytes()
     with pytest.raises(steersman.Error, match="exists"):
         steersman.record("lake", lake, laps=0.1, progress=False)
+    ahead = tmp_path / "ahead"
+    assert steersman_program("record", "--track", "lake", "--laps", 0.12, "--label-ahead", 8, "--out", ahead)[0] == 0
+    steersman.record("lake", tmp_path / "same", laps=0.12, label_ahead_m=8, progress=False)
+    log = (ahead / "driving_log.csv").read_bytes()
+    assert (tmp_path / "same" / "driving_log.csv").read_bytes() == log != (lake / "driving_log.csv").read_bytes()
     keys = steersman.record("lake", tmp_path / "keys", laps=0.1, style="keyboard", reverse=True, hz=5, progress=False)
     assert keys.rate_hz == 5 and (keys.steering == 0).mean() > 0.3
 

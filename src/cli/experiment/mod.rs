@@ -85,7 +85,7 @@ enum SubjectArg {
     Labels,
     /// Models of all qualities: does driving on a recording tell how they drive in the simulator?
     Replay,
-    /// Averaged weights, noise in the pictures, terms of smoothness, blur before strides, ELU: what makes the wheel calm
+    /// Small batches, averaged weights, noise in the pictures, terms of smoothness, blur before strides, ELU: what makes the wheel calm
     Smooth,
 }
 
