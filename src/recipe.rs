@@ -398,6 +398,22 @@ mod tests {
     }
 
     #[test]
+    fn corrections_of_side_cameras_and_shifts_are_those_of_the_labels_distance() {
+        for name in ["default", "calm"] {
+            let recipe = Recipe::find(name, &[]).unwrap();
+            let ahead_m = recipe.labels.expert_ahead_m.unwrap();
+            // Of a place `aside_m` beside the line: pure pursuit with a wheelbase of 2.87 m.
+            let steering =
+                |aside_m: f64| (2.0 * 2.87 * aside_m / ahead_m.powi(2)).atan().to_degrees() / recipe.full_lock_deg;
+            let side_cameras = recipe.samples.side_cameras.unwrap().fixed();
+            assert!((side_cameras - steering(0.81)).abs() < 5e-4, "{name}: {side_cameras}");
+            // The camera stands 2.63 m before the rear axle, and has a focal length of 138.6 pixels.
+            let per_px = recipe.augmentation.shift_steering_per_px.unwrap().fixed();
+            assert!((per_px - steering((ahead_m - 2.63) / 138.6)).abs() < 1e-4, "{name}: {per_px}");
+        }
+    }
+
+    #[test]
     fn shipped_recipes_are_called_like_their_files_and_survive_being_written() {
         for (name, _) in SHIPPED {
             let recipe = Recipe::find(name, &[]).unwrap();

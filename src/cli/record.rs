@@ -47,7 +47,7 @@ pub struct RecordArgs {
     #[arg(long, value_name = "MPS2", num_args = 0..=1, require_equals = true, default_missing_value = "2.5")]
     slower_in_bends: Option<f64>,
     /// Label with the steering towards the point of the line METRES ahead (3 to 30) instead of what the expert steers: smaller from farther
-    /// away, so that a model's errors about its place move the wheel less
+    /// away, so that a model's errors about its place move the wheel less; no driven path can be reckoned from such labels
     #[arg(long, value_name = "METRES")]
     label_ahead: Option<f64>,
     /// Standard deviation of a disturbance of the steering that the labels do not show

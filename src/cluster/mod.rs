@@ -38,7 +38,7 @@
 //!
 //! With `hyper` on two cores (AVX-512) `a` is 1.08 ms, `d` 0.18 ms, `u` 1.6 ms and `m` 16, from `--profile` of one process, and `v` was counted as
 //! 1.07 MB on 2 ranks and 1.57 MB on 4. On one busy machine 1, 2 and 4 ranks of one thread trained 765, 1,169 and 970 images/s, and the rank
-//! that waited least spent 5 % of the time of its steps on meetings with 2 ranks and 21 % with 4, twice as many as cores (`default`: 7 and 34 %).
+//! that waited least spent 5 % of the time of its steps on meetings with 2 ranks and 21 % with 4, twice as many as cores (`default` in batches of 64: 7 and 34 %).
 //! Waiting for slower ranks is in that, so it is the most that an overlap with the backward pass could win. For 2 ranks the formula gives 1,552
 //! images/s: it does not know of ranks that wait for a core.
 //!

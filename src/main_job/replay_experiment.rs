@@ -9,7 +9,7 @@ use serde::Serialize;
 use steersman_kernels::Isa;
 
 use super::job::{JobEvent, test_on_tracks};
-use crate::dataset::{self, Recording};
+use crate::dataset::{self, Correction, Recording};
 use crate::engine::random::{Purpose, rng, unit};
 use crate::error::{Error, Result};
 use crate::files::atomic_file;
@@ -108,6 +108,21 @@ fn models_of(seed: u64, first: usize) -> Vec<Origin> {
     models.extend([0.1, 0.2, 0.3, 0.45, 0.6].map(|noise| Origin::Spoilt { of: first, noise }));
     models.extend([0.02, 0.04, 0.06, 0.08, 0.12].map(|noise| Origin::Spoilt { of: first + 1, noise }));
     models
+}
+
+/// Steering of full lock that a side camera, and a pixel of shift, ask for by the expert's own labels, which lead to the point 6.13 m ahead of the
+/// rear axle: `atan(2.87 m * 2 * x / (6.13 m)^2)` of 25 deg, where `x` is 0.81 m, and 3.5 m / 138.6 for a pixel.
+const SIDE_CAMERAS: f64 = 0.28;
+const SHIFT_STEERING_PER_PX: f64 = 0.009;
+
+/// The shipped recipe `name` for labels that are what the expert drives, as the path of these recordings is judged.
+fn for_driven_labels(name: &str, epochs: u32) -> Result<Recipe> {
+    let mut recipe = Recipe::find(name, &[format!("epochs={epochs}")])?;
+    if recipe.labels.expert_ahead_m.take().is_some() {
+        recipe.samples.side_cameras = Some(Correction::Fixed(SIDE_CAMERAS));
+        recipe.augmentation.shift_steering_per_px = Some(Correction::Fixed(SHIFT_STEERING_PER_PX));
+    }
+    Ok(recipe)
 }
 
 impl Origin {
@@ -230,7 +245,7 @@ pub fn run(
         let model = match origin {
             Origin::Trained { recipe, epochs, seed, share } => {
                 let recordings = trained[usize::from(*share == Share::Tenth)].clone();
-                let recipe = Recipe::find(recipe, &[format!("epochs={epochs}")])?;
+                let recipe = for_driven_labels(recipe, *epochs)?;
                 let request = TrainRequest::new(recordings, recipe, folder.join(format!("run-{number}")));
                 let request = TrainRequest { seed: *seed, cache_mib: plan.cache_mib, ..request };
                 let result = training::train(request, &mut |event| of_job(JobEvent::Training(event)), stop)?;
@@ -386,6 +401,15 @@ mod tests {
         assert!((found.validation_error + 0.2).abs() < 1e-12, "{found:?}");
         assert_eq!(RankCorrelations::of(&rows[..2]), None);
         assert_eq!(RankCorrelations::of(&[row(1.0, 5.0, 1.0), row(2.0, 5.0, 2.0), row(3.0, 5.0, 3.0)]), None);
+    }
+
+    #[test]
+    fn recipes_with_labels_from_farther_ahead_take_those_that_were_driven() {
+        let found = for_driven_labels("default", 3).unwrap();
+        assert_eq!((found.epochs, found.labels.expert_ahead_m), (3, None));
+        let corrections = [found.samples.side_cameras, found.augmentation.shift_steering_per_px];
+        assert_eq!(corrections, [0.28, 0.009].map(|steering| Some(Correction::Fixed(steering))));
+        assert_eq!(for_driven_labels("lenet", 2).unwrap(), Recipe::find("lenet", &["epochs=2".into()]).unwrap());
     }
 
     #[test]

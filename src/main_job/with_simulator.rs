@@ -47,8 +47,8 @@ pub fn beside_recordings(
     if !held_out.is_empty() {
         notice(&trained_on_held_out(&held_out));
     }
+    recipe.labels.notice_of_recordings().into_iter().for_each(notice);
     if allowed.with_simulator.is_none() {
-        recipe.labels.notice_without_expert().into_iter().for_each(notice);
         return Ok(Vec::new());
     }
     let takes = training_set::labelled(&training_set::takes(), recipe);

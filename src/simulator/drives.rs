@@ -105,13 +105,15 @@ pub fn drive_legs(
 }
 
 /// Mean absolute error of `pilot` on frames that the expert sees on `track` in a drive drawn by `seed`, in degrees of the
-/// front wheels: what evaluation of recordings calls MAE.
+/// front wheels: what evaluation of recordings calls MAE. The labels look as far ahead as those that the pilot learned from
+/// ([`LabelSpec::expert_ahead_m`](crate::dataset::LabelSpec::expert_ahead_m)).
 ///
 /// # Errors
 ///
 /// [`Error::Codec`] if a picture cannot be encoded.
 pub fn offline_mae_deg(pilot: &Pilot, track: &Track, seed: u64) -> Result<f64> {
-    let samples = drive_expert(track, &RecordOptions { seed, ..Default::default() });
+    let label_ahead_m = pilot.recipe().labels.expert_ahead_m;
+    let samples = drive_expert(track, &RecordOptions { seed, label_ahead_m, ..Default::default() });
     let (mut pilot, mut eye) = (pilot.clone(), FrontCamera::new(track, seed));
     if samples.is_empty() {
         return Err(Error::Data {
@@ -213,9 +215,12 @@ impl Message for Drives {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::model_file::Model;
     use crate::observer::Unobserved;
+    use crate::recipe::Recipe;
     use crate::simulator::car::speed::Speed;
     use crate::simulator::trial::drive::drive;
+    use steersman_kernels::Isa;
 
     #[test]
     fn the_frames_of_the_offline_error_are_spread_over_the_whole_drive() {
@@ -224,6 +229,18 @@ mod tests {
             assert!(places.len() == OFFLINE_FRAMES && places[0] == 0, "{len}");
             assert!(places.is_sorted_by(|a, b| a < b) && *places.last().unwrap() >= len - len.div_ceil(OFFLINE_FRAMES));
         }
+    }
+
+    #[test]
+    fn the_offline_error_is_that_from_labels_as_far_ahead_as_those_that_were_learned() {
+        let track = Track::load("lake").unwrap();
+        let [own, farther] = [&[][..], &["labels.expert_ahead_m=12.0".into()]].map(|set| {
+            let recipe = Recipe::find("lenet", set).unwrap();
+            let parameters = recipe.network(Isa::PORTABLE).unwrap().initialize(1);
+            let model = Model { recipe, parameters, record: Default::default(), training_rows: Vec::new() };
+            offline_mae_deg(&Pilot::new(model, Isa::PORTABLE).unwrap(), &track, 1).unwrap()
+        });
+        assert!(own > 0.0 && farther > 0.0 && own != farther, "{own} {farther}");
     }
 
     fn legs() -> Vec<Leg> {

@@ -85,7 +85,7 @@ enum SubjectArg {
     Labels,
     /// Models of all qualities: does driving on a recording tell how they drive in the simulator?
     Replay,
-    /// Small batches, averaged weights, noise in the pictures, terms of smoothness, blur before strides, ELU: what makes the wheel calm
+    /// Larger batches, averaged weights, noise in the pictures, terms of smoothness, blur before strides, ELU: what makes the wheel calm
     Smooth,
 }
 
@@ -138,7 +138,10 @@ pub fn run(args: ExperimentArgs) -> Result<()> {
             let takes = takes(args.random_tracks.unwrap_or(USUAL_RANDOM_TRACKS) as usize);
             pool.install(|| training_set(RECORDINGS.as_ref(), &labelled(&takes, &recipe), None, &mut display, &stop))
         }
-        false => Ok(given),
+        false => {
+            recipe.labels.notice_of_recordings().into_iter().for_each(|notice| eprintln!("note: {notice}"));
+            Ok(given)
+        }
     };
     let recordings = recordings.inspect_err(|_| drop(std::fs::remove_file(&out)))?;
     let subject = match args.subject {

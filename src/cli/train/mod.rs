@@ -31,7 +31,7 @@ use crate::training::{self, DEFAULT_CACHE_MIB, NewRun, RunFolder, TrainRequest, 
 /// Time of one core (Zen 3, 2.4 GHz) for recording and for driving, s.
 const SIMULATOR_CORE_S: f64 = 160.0;
 /// The same for training the default recipe.
-const TRAINING_CORE_S: f64 = 180.0;
+const TRAINING_CORE_S: f64 = 160.0;
 /// Reading and changing an image takes as long as this many multiply-adds.
 const IMAGE_MULTIPLY_ADDS: f64 = 1.5e6;
 

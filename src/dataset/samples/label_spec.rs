@@ -50,8 +50,8 @@ impl Default for LabelSpec {
 pub const EXPERT_AHEAD_M: RangeInclusive<f64> = 3.0..=30.0;
 
 impl LabelSpec {
-    /// What to tell of an entry that has no effect where only recordings are trained on, if there is one.
-    pub fn notice_without_expert(&self) -> Option<&'static str> {
+    /// What to tell of an entry that has no effect on recordings, where some are trained on, if there is one.
+    pub fn notice_of_recordings(&self) -> Option<&'static str> {
         self.expert_ahead_m.map(|_| {
             "labels.expert_ahead_m acts on the simulator's expert only (train without a recording, or --with-simulator); the labels of these \
              recordings, for which side_cameras and shift_steering_per_px of the recipe may be wrong, stay as they are"

@@ -169,8 +169,9 @@ def record(
         seed: draws where the drive begins, its light and its texture.
         speed_mph: speed to hold, mph.
         slower_in_bends_mps2: drive slower in bends, so that the car is pushed sideways by at most this, m/s².
-        label_ahead_m: the labels lead to the point of the line so many metres ahead of the rear axle, as the recipes ``default`` (8) and
-            ``calm`` (10) want them, while the car drives towards a nearer one; by default they are what it drives.
+        label_ahead_m: label with the steering towards the point of the line so many metres ahead of the rear axle (3 to 30), as the recipes
+            ``default`` (8) and ``calm`` (10) want it, while the car drives as ever (6.13 m at 20 mph). The driven path, which is reckoned
+            from the labels, is none then. Without it the labels are what the car drives.
         noise: standard deviation of a disturbance of the steering that the labels do not show.
         hz: rows of the log for each second: 1, 2, 5, 10, 25 or 50.
         format: ``"sample"``: as Udacity's sample data; ``"v2"``: as version 2 of the simulator, without header.
