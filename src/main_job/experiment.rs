@@ -431,7 +431,7 @@ mod tests {
         assert_eq!(found, expected);
         let batches: Vec<_> = variants.iter().map(|(_, recipe)| recipe.batch).collect();
         assert!(batches[1] == 4 * base.batch && [&batches[..1], &batches[2..]].concat() == [base.batch; 9]);
-        // The three that cost no laps make `default`.
+        // Blur, noise and ELU make `default`.
         assert_eq!(variants[8].1, base);
     }
 
