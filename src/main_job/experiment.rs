@@ -40,8 +40,8 @@ pub enum Subject {
     Smooth,
 }
 
-/// Factor of the larger batches, decay of the averaged weights, amplitudes of the noise of pixels and blocks in grey levels, and weights of the smoothness terms, of
-/// [`Subject::Smooth`].
+/// Factor of the larger batches, decay of the averaged weights, amplitudes of the noise of pixels and blocks in grey levels, and weights
+/// of the smoothness terms, of [`Subject::Smooth`].
 const LARGER: usize = 4;
 const DECAY: f64 = 0.998;
 const NOISE: [f64; 2] = [48.0, 16.0];

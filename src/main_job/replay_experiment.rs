@@ -110,8 +110,8 @@ fn models_of(seed: u64, first: usize) -> Vec<Origin> {
     models
 }
 
-/// Steering of full lock that a side camera, and a pixel of shift, ask for by the expert's own labels, which lead to the point 6.13 m ahead of the
-/// rear axle: `atan(2.87 m * 2 * x / (6.13 m)^2)` of 25 deg, where `x` is 0.81 m, and 3.5 m / 138.6 for a pixel.
+/// Shares of full lock by which a side camera and a pixel of shift change the expert's own labels, which lead to the point 6.13 m ahead of
+/// the rear axle: `atan(2.87 m * 2 * x / (6.13 m)^2)` of 25 deg, where `x` is 0.81 m for a camera and 3.5 m / 138.6 for a pixel.
 const SIDE_CAMERAS: f64 = 0.28;
 const SHIFT_STEERING_PER_PX: f64 = 0.009;
 
